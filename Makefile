@@ -1,0 +1,57 @@
+# Everything is one command; every command first builds .venv from requirements.lock.
+SCALE ?= laptop
+DATA  ?= shapes
+ROOT  ?=
+ARGS  ?=
+PYTHON ?= python3
+UV_VERSION := 0.13.9
+
+export PYTHONUNBUFFERED := 1
+BIN := .venv/bin
+EXPERIMENTS := exp1.1 exp1.2 exp1.3 exp1.4
+RUN_OPTIONS = --scale $(SCALE) --data.data $(DATA) $(if $(ROOT),--data.root "$(ROOT)") $(ARGS)
+
+.PHONY: help $(EXPERIMENTS) all smoke docs bench lint format test test-slow lock clean
+
+help:  ## list the targets
+	@echo "make TARGET [SCALE=smoke|laptop|paper] [DATA=shapes|modelnet40] [ROOT=folder] [ARGS='--key value']"
+	@grep -hE '^[a-z$$()_A-Z0-9.-]+:.*##' $(MAKEFILE_LIST) | sed 's/\$$(EXPERIMENTS)/exp1.1 ... exp1.4/; s/:.*##/\t/' | expand -t 22
+
+$(EXPERIMENTS): exp%: .venv/ready  ## train both arms of an experiment, print ours beside the paper's
+	$(BIN)/python reproduce/exp$(subst .,_,$*).py $(RUN_OPTIONS)
+
+all: $(EXPERIMENTS)  ## every experiment
+
+docs: .venv/ready  ## rewrite the tables of README.md and the pictures of docs/ from results/
+	$(BIN)/corrmat report
+	$(BIN)/corrmat data --sheet docs/shapes.png
+
+bench: .venv/ready  ## speed: pairs a second, training steps, ratios against a naive twin
+	$(BIN)/python benchmarks/bench.py
+
+lint: .venv/ready  ## ruff and pyright
+	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/pyright
+
+format: .venv/ready  ## let ruff rewrite what it can
+	$(BIN)/ruff check --fix . && $(BIN)/ruff format .
+
+test: .venv/ready  ## everything but the slow learning tests, smoke training of every experiment included
+	$(BIN)/pytest
+
+test-slow: .venv/ready  ## the learning tests
+	$(BIN)/pytest -m slow
+
+lock: .venv/ready  ## compile requirements.lock anew from pyproject.toml
+	$(BIN)/uv pip compile pyproject.toml --extra dev --universal --python-version 3.11 \
+		--generate-hashes --no-header --quiet --upgrade --output-file requirements.lock
+
+clean:  ## remove the environment and all runs (results/ stays)
+	rm -rf .venv runs
+
+.venv/ready: requirements.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "corrmat needs Python 3.11 or newer; name one with PYTHON=...")'
+	$(PYTHON) -m venv --clear .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv==$(UV_VERSION)
+	$(BIN)/uv pip install --quiet --python $(BIN)/python --require-hashes -r requirements.lock
+	$(BIN)/uv pip install --quiet --python $(BIN)/python --no-build-isolation --no-deps --editable .
+	@touch $@

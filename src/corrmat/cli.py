@@ -1,0 +1,139 @@
+"""The command line: corrmat run | fit | evaluate | data | report."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from corrmat.errors import CorrmatError
+
+EPILOG = """examples:
+  corrmat run --config configs/exp/1.1.yaml                     both arms at laptop scale, our numbers beside the paper's
+  corrmat run --config configs/exp/1.2.yaml --scale smoke       the same in seconds, to see that everything works
+  corrmat fit --config configs/exp/1.1.yaml --arm DCP_corr --trainer.max_steps 200 --data.num_points 256
+  corrmat evaluate --config configs/exp/1.1.yaml --arm DCP_corr --checkpoint runs/laptop/shapes/1.1/DCP_corr/best.ckpt
+  corrmat data --sheet shapes.png                               make the embedded data set, draw its families
+
+Whatever a recipe sets can be set here: --data.*, --network.*, --optimizer.*, --trainer.* (Lightning's own
+Trainer) and --seed. `corrmat fit --help` lists them all with their types.
+exit codes: 0 done, 1 interrupted (the same command goes on), 2 something given cannot be used."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run a command; errors of the user's making are one line, never a traceback."""
+    words = sys.argv[1:] if arguments is None else arguments
+    try:
+        return _command(words)
+    except CorrmatError as error:
+        print(f"corrmat: error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("corrmat: interrupted; nothing was recorded", file=sys.stderr)
+        return 1
+
+
+def reproduce(experiment: str) -> None:
+    """What a script of reproduce/ does: run the experiment of this id, with the caller's options."""
+    config = Path(sys.argv[0]).resolve().parents[1] / "configs" / "exp" / f"{experiment}.yaml"
+    sys.exit(main(["run", "--config", str(config), *sys.argv[1:]]))
+
+
+def _command(words: list[str]) -> int:
+    parser = argparse.ArgumentParser(
+        "corrmat",
+        description="Correspondence Matrices are Underrated (3DV 2020), reproduced.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    commands = parser.add_subparsers(dest="command", metavar="command", required=True)
+    for name, purpose in (
+        ("run", "train and test both arms of an experiment, write a record, print it beside the paper's"),
+        ("fit", "train one arm"),
+        ("evaluate", "test the checkpoint of one arm"),
+    ):
+        command = commands.add_parser(name, help=purpose, description=purpose, add_help=False, allow_abbrev=False)
+        _experiment_options(command, name)
+    data = commands.add_parser("data", help="make the embedded data set, draw its families")
+    data.add_argument("--sheet", type=Path, metavar="PNG", help="draw one shape of every family")
+    report = commands.add_parser("report", help="rewrite the tables of the documents from results/")
+    report.add_argument("--results", type=Path, default=Path("results"), help="folder of records")
+    report.add_argument("--readme", type=Path, default=Path("README.md"), help="where the table goes")
+    known, options = parser.parse_known_args(words)
+    if known.command == "data":
+        _refuse(options)
+        return _data(known.sheet)
+    if known.command == "report":
+        _refuse(options)
+        return _report(known.results, known.readme)
+    return _experiment(known, options)
+
+
+def _experiment_options(command: argparse.ArgumentParser, name: str) -> None:
+    command.add_argument("--help", "-h", action="store_true", help="show every option and its type")
+    command.add_argument("--config", type=Path, help="the experiment, e.g. configs/exp/1.1.yaml")
+    command.add_argument("--scale", default="laptop", choices=["smoke", "laptop", "paper"], help="default: laptop")
+    command.add_argument("--runs", type=Path, default=Path("runs"), help="folder of checkpoints and logs")
+    if name == "run":
+        command.add_argument("--results", type=Path, default=Path("results"), help="folder of records")
+    else:
+        command.add_argument("--arm", default="DCP_corr", help="DCP or DCP_corr (default)")
+    if name == "evaluate":
+        command.add_argument("--checkpoint", type=Path, help="default: best.ckpt of the arm's last fit or run")
+    command.set_defaults(usage_text=command.format_help())
+
+
+def _experiment(known: argparse.Namespace, options: list[str]) -> int:
+    # Imported here, so that --help and mistakes do not wait for torch.
+    from corrmat import experiment, metrics, recipe
+
+    if known.help:
+        print(known.usage_text)
+        print(recipe.parser(getattr(known, "arm", "DCP_corr")).format_help().split("\n\n", 1)[1])
+        return 0
+    if known.config is None:
+        raise CorrmatError("which experiment? --config configs/exp/1.1.yaml")
+    arms = None if known.command == "run" else [known.arm]
+    found = recipe.load(known.config, known.scale, options, arms)
+    if known.command == "run":
+        experiment.run(found, known.results, known.runs)
+        return 0
+    settings = found.settings[known.arm]
+    folder = known.runs / found.scale / found.data / found.id / known.arm
+    if known.command == "fit":
+        trained = experiment.train(known.arm, settings, folder, group=f"{found.scale}/{found.data}/{found.id}")
+        print(f"best checkpoint: {trained.checkpoint}")
+        return 0
+    checkpoint = known.checkpoint or folder / "best.ckpt"
+    for scored in experiment.test(known.arm, settings, checkpoint, found.bands_deg):
+        for name, value in metrics.summary(scored).items():
+            print(f"{name:28s} {value:.6g}")
+    return 0
+
+
+def _data(sheet: Path | None) -> int:
+    from corrmat.data import shapes
+
+    for split in shapes.SIZE:
+        clouds = shapes.load(split)
+        print(f"{split}: {len(clouds)} shapes of {len(clouds.names)} families in {shapes.cache_folder()}")
+    if sheet is not None:
+        from corrmat.data.sheet import draw
+
+        draw(shapes.load("train"), sheet)
+        print(f"drawn: {sheet}")
+    return 0
+
+
+def _report(results: Path, readme: Path) -> int:
+    from corrmat import report
+
+    records = report.read_records(results)
+    if not records:
+        raise CorrmatError(f"no records in {results}; run an experiment first")
+    report.refresh(readme, "results", report.markdown_summary(records))
+    print(f"{len(records)} records -> {readme}")
+    return 0
+
+
+def _refuse(options: list[str]) -> None:
+    if options:
+        raise CorrmatError(f"unknown option {options[0]!r}; see corrmat --help")

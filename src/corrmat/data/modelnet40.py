@@ -1,0 +1,50 @@
+"""ModelNet40 as sampled clouds, in the official HDF5 layout (Qi et al., PointNet)."""
+
+from pathlib import Path, PurePosixPath
+
+from corrmat.data.clouds import CloudSet, concatenate, read_hdf5
+from corrmat.errors import CorrmatError
+
+FOLDER = "modelnet40_ply_hdf5_2048"
+SOURCE = "https://shapenet.cs.stanford.edu/media/modelnet40_ply_hdf5_2048.zip"
+
+
+def load(root: Path, split: str) -> CloudSet:
+    """Read a split.
+
+    Args:
+        root: the folder `modelnet40_ply_hdf5_2048`, or the one that holds it.
+        split: "train" or "test", as the official file lists have it.
+
+    Raises:
+        CorrmatError: a folder, list or file is missing or damaged; the message names it.
+    """
+    folder = _folder(root)
+    names = tuple(_lines(folder / "shape_names.txt"))
+    # The official lists say "data/modelnet40_ply_hdf5_2048/<file>": only the name counts.
+    files = [PurePosixPath(line).name for line in _lines(folder / f"{split}_files.txt")]
+    for file in files:
+        if not (folder / file).is_file():
+            raise CorrmatError(
+                f"{folder / file} is missing, but {split}_files.txt names it; fetch it again"
+            )
+    return concatenate([read_hdf5(folder / file, names) for file in files])
+
+
+def _folder(root: Path) -> Path:
+    for folder in (root, root / FOLDER):
+        if (folder / "shape_names.txt").is_file():
+            return folder
+    raise CorrmatError(
+        f"no ModelNet40 in {root} (looked for shape_names.txt and {FOLDER}/); "
+        f"unpack {SOURCE} there, or use --data.data shapes"
+    )
+
+
+def _lines(path: Path) -> list[str]:
+    if not path.is_file():
+        raise CorrmatError(f"{path} is missing; fetch the data set again")
+    lines = [line.strip() for line in path.read_text().splitlines() if line.strip()]
+    if not lines:
+        raise CorrmatError(f"{path} is empty; fetch the data set again")
+    return lines

@@ -1,0 +1,28 @@
+"""The contact sheet of a set of clouds: one shape of every category, side by side."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from corrmat.data.clouds import CloudSet
+
+
+def draw(clouds: CloudSet, path: Path, columns: int = 8) -> None:
+    """Write a PNG with the first shape of each category, seen from one corner, shaded by normal."""
+    found = [np.flatnonzero(clouds.labels == label) for label in range(len(clouds.names))]
+    shown = [(name, index[0]) for name, index in zip(clouds.names, found, strict=True) if len(index)]
+    rows = -(-len(shown) // columns)
+    figure = Figure(figsize=(1.9 * columns, 2.0 * rows), layout="constrained")
+    light = np.array([0.4, -0.7, 0.6]) / np.linalg.norm([0.4, -0.7, 0.6])
+    for place, (name, index) in enumerate(shown):
+        axes = figure.add_subplot(rows, columns, place + 1, projection="3d", computed_zorder=False)
+        x, y, z = clouds.points[index].T
+        shade = 0.25 + 0.75 * np.abs(clouds.normals[index] @ light)
+        axes.scatter(x, y, z, c=shade, cmap="viridis", vmin=0, vmax=1, s=3, linewidths=0)
+        axes.set(xlim=(-0.75, 0.75), ylim=(-0.75, 0.75), zlim=(-0.75, 0.75))
+        axes.view_init(elev=22, azim=-60)
+        axes.set_axis_off()
+        axes.set_title(name, fontsize=9, y=0.92)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=80, metadata={"Software": None})

@@ -1,0 +1,52 @@
+"""Deep Closest Point (Wang & Solomon, ICCV 2019), the network of experiments 1.1 to 1.4."""
+
+from typing import Literal
+
+from torch import Tensor, nn
+
+from corrmat.networks.attention import Transformer
+from corrmat.networks.dgcnn import DGCNN
+from corrmat.ops.correspondence import SoftCorrespondence
+from corrmat.ops.rigid import procrustes
+from corrmat.types import Prediction
+
+
+class DCPNetwork(nn.Module):
+    """DGCNN features, a pointer, soft correspondence, Procrustes (paper figure 4a).
+
+    Args:
+        width: feature dimension d.
+        pointer: "transformer" (DCP v2) lets each cloud's features see the other's,
+            "identity" (DCP v1) does not.
+        heads: attention heads of the transformer.
+        feedforward: hidden width of its feed-forward blocks.
+        edge_channels: widths of DGCNN's edge convolutions.
+        k: neighbours of each point, itself included.
+    """
+
+    def __init__(
+        self,
+        width: int = 512,
+        pointer: Literal["transformer", "identity"] = "transformer",
+        heads: int = 4,
+        feedforward: int = 1024,
+        edge_channels: tuple[int, ...] = (64, 64, 128, 256),
+        k: int = 20,
+    ) -> None:
+        super().__init__()
+        self.embed = DGCNN(width, edge_channels, k)
+        self.pointer = Transformer(width, heads, feedforward) if pointer == "transformer" else None
+
+    def features(self, source: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+        """Features (B, N, d) and (B, M, d) that are compared with each other."""
+        f_x, f_y = self.embed(source[..., :3]), self.embed(target[..., :3])
+        if self.pointer is None:
+            return f_x + f_x, f_y + f_y
+        return f_x + self.pointer(f_x, f_y), f_y + self.pointer(f_y, f_x)
+
+    def forward(self, source: Tensor, target: Tensor) -> Prediction:
+        """Register source (B, N, 3 or more) to target (B, M, 3 or more); xyz are read."""
+        f_x, f_y = self.features(source, target)
+        c = SoftCorrespondence(f_x, f_y, scale=f_x.shape[-1] ** -0.5)
+        rotation, translation = procrustes(source[..., :3], c.soft_target(target[..., :3]))
+        return Prediction(rotation, translation, c)

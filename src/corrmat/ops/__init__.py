@@ -1,0 +1,1 @@
+"""Pure tensor functions: no module, config, file or device."""

@@ -1,0 +1,139 @@
+"""Rigid motions as batched tensors: apply, compose, invert, axis-angle, weighted Procrustes.
+
+Convention everywhere: `R @ x + t` takes the source onto the target.
+"""
+
+import torch
+from torch import Tensor
+
+
+def apply(rotation: Tensor, translation: Tensor, points: Tensor) -> Tensor:
+    """Move points by a rigid motion.
+
+    Args:
+        rotation: (..., 3, 3).
+        translation: (..., 3).
+        points: (..., N, 3), leading dimensions as the motion's.
+
+    Returns:
+        (..., N, 3), `R @ x + t` for every point x.
+    """
+    return points @ rotation.mT + translation.unsqueeze(-2)
+
+
+def compose(
+    outer: tuple[Tensor, Tensor], inner: tuple[Tensor, Tensor]
+) -> tuple[Tensor, Tensor]:
+    """The motion that applies `inner` first and `outer` second; each is ((..., 3, 3), (..., 3))."""
+    rotation, translation = outer
+    return rotation @ inner[0], apply(rotation, translation, inner[1].unsqueeze(-2)).squeeze(-2)
+
+
+def invert(rotation: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
+    """The motion that undoes ((..., 3, 3), (..., 3))."""
+    inverse = rotation.mT
+    return inverse, -(inverse @ translation.unsqueeze(-1)).squeeze(-1)
+
+
+def axis_angle_to_matrix(axis: Tensor, angle_rad: Tensor) -> Tensor:
+    """Rotation matrices by Rodrigues' formula.
+
+    Args:
+        axis: (..., 3) unit vectors.
+        angle_rad: (...) angles in radians.
+
+    Returns:
+        (..., 3, 3).
+    """
+    cross = _cross_matrix(axis)
+    sine, cosine = angle_rad.sin()[..., None, None], angle_rad.cos()[..., None, None]
+    identity = torch.eye(3, dtype=axis.dtype, device=axis.device)
+    return identity + sine * cross + (1 - cosine) * (cross @ cross)
+
+
+def procrustes(
+    source: Tensor, target: Tensor, weight: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Weighted orthogonal Procrustes (Horn / Kabsch): the motion that best takes source onto target.
+
+    Minimises `sum_i w_i ||R x_i + t - y_i||^2` over proper rotations, in float64 inside.
+    Where the points do not determine the rotation (all equal, or on a line) one of the
+    minimisers is returned, and the gradient is finite.
+
+    Args:
+        source: (B, N, 3) points x.
+        target: (B, N, 3) their matches y.
+        weight: (B, N), not negative; None for equal weights. A pair whose weights sum
+            to zero is treated as one without points: identity rotation.
+
+    Returns:
+        rotation (B, 3, 3) and translation (B, 3), in the dtype of `source`.
+    """
+    x, y = source.double(), target.double()
+    if weight is None:
+        share = x.new_full(x.shape[:2], 1 / max(x.shape[1], 1))
+    else:
+        share = weight.double()
+        share = share / share.sum(1, keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)
+    share = share.unsqueeze(-1)
+    centre_x, centre_y = (share * x).sum(1), (share * y).sum(1)
+    covariance = (share * (x - centre_x.unsqueeze(1))).mT @ (y - centre_y.unsqueeze(1))
+    rotation = rotation_from_covariance(covariance)
+    translation = centre_y - (rotation @ centre_x.unsqueeze(-1)).squeeze(-1)
+    return rotation.to(source.dtype), translation.to(source.dtype)
+
+
+def rotation_from_covariance(covariance: Tensor) -> Tensor:
+    """The proper rotation R that maximises `trace(R @ H)` for H = sum_i w_i x_i y_i^T.
+
+    Args:
+        covariance: H, (B, 3, 3).
+
+    Returns:
+        (B, 3, 3). Its gradient does not go through the singular vectors, so equal
+        singular values do no harm; see `_RotationFromCovariance`.
+    """
+    return _RotationFromCovariance.apply(covariance)  # type: ignore[no-any-return]
+
+
+class _RotationFromCovariance(torch.autograd.Function):
+    """SVD forward; backward by perturbing the optimality condition instead of the SVD.
+
+    At the optimum G = R H is symmetric. With R -> exp([w]) R and H -> H + dH, staying
+    symmetric demands (tr(G) I - G) w = axial(R dH), a 3 x 3 system that is singular only
+    where the rotation itself is not determined. There we drop the undetermined directions.
+    """
+
+    @staticmethod
+    def forward(ctx, covariance: Tensor) -> Tensor:  # noqa: ANN001
+        u, s, vh = torch.linalg.svd(covariance)
+        sign = torch.det(vh.mT @ u.mT).sign()
+        flip = torch.stack([torch.ones_like(sign), torch.ones_like(sign), sign], -1)
+        rotation = (vh.mT * flip.unsqueeze(-2)) @ u.mT
+        ctx.save_for_backward(rotation, vh, s * flip)
+        return rotation
+
+    @staticmethod
+    def backward(ctx, grad: Tensor) -> Tensor:  # type: ignore[override]  # noqa: ANN001
+        rotation, vh, eigenvalue = ctx.saved_tensors
+        # In the basis V, G is diagonal and so is tr(G) I - G.
+        curvature = eigenvalue.sum(-1, keepdim=True) - eigenvalue
+        floor = eigenvalue[..., :1] * 1e-9 + torch.finfo(grad.dtype).tiny
+        inverse = torch.where(curvature > floor, 1 / curvature.clamp_min(floor), 0)
+        pull = _axial(grad @ rotation.mT).unsqueeze(-1)
+        omega = (vh.mT @ (inverse.unsqueeze(-1) * (vh @ pull))).squeeze(-1)
+        return -rotation.mT @ _cross_matrix(omega)
+
+
+def _cross_matrix(vector: Tensor) -> Tensor:
+    """(..., 3) -> (..., 3, 3) with `[v] @ u = v x u`."""
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    rows = [zero, -z, y, z, zero, -x, -y, x, zero]
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+def _axial(matrix: Tensor) -> Tensor:
+    """(..., 3, 3) -> (..., 3): the vector a with `<matrix, [w]> = <a, w>` for every w."""
+    m = matrix - matrix.mT
+    return torch.stack([m[..., 2, 1], m[..., 0, 2], m[..., 1, 0]], -1)

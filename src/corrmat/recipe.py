@@ -1,0 +1,135 @@
+"""A recipe is YAML: what an experiment claims, and the settings of its arms at every scale.
+
+Layers, each over the one before: the family's file (`base`), its scale, the experiment's
+file, its scale, the arm's own lines, the command line. The sum is checked against the types
+of the classes that it configures, so a misspelt key is an error and nothing starts.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import yaml
+from jsonargparse import ArgumentParser, Namespace
+
+from corrmat.data.datamodule import RegistrationDataModule
+from corrmat.errors import CorrmatError
+from corrmat.methods import METHODS
+from corrmat.module import OptimizerSettings
+
+SCALES = ("smoke", "laptop", "paper")
+GROUPS = ("data", "network", "optimizer", "trainer")
+_TOP = {"id", "title", "paper", "arms", "scales", "bands_deg", "networks_of", "base", "seed", *GROUPS}
+_NOT_TRAINER = {"logger", "callbacks", "default_root_dir", "plugins", "profiler", "model_registry"}
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """One experiment at one scale."""
+
+    id: str
+    title: str
+    scale: str
+    paper: dict[str, Any]  # arm -> what the paper reports, by our metrics' names
+    settings: dict[str, Namespace]  # arm -> seed, data, network, optimizer, trainer
+    bands_deg: tuple[float, ...]  # edges of rotation bands to test on one by one; may be empty
+    networks_of: str | None  # the experiment whose trained networks serve here too
+
+    @property
+    def data(self) -> str:
+        """Which data set: "shapes" or "modelnet40"."""
+        return next(iter(self.settings.values())).data.data
+
+
+def load(path: Path, scale: str, options: list[str], arms: list[str] | None = None) -> Recipe:
+    """Read a recipe and put command-line options over it.
+
+    Args:
+        path: the experiment's YAML file.
+        scale: one of `SCALES`.
+        options: typed overrides, e.g. ["--data.num_points", "256"].
+        arms: only these arms.
+
+    Raises:
+        CorrmatError: the file, a key, a value or an option is not as it should be.
+    """
+    experiment = _read(path)
+    base = _read(path.parent / experiment["base"]) if "base" in experiment else {}
+    layers = [base, _scale(base, scale), experiment, _scale(experiment, scale)]
+    merged: dict[str, Any] = {}
+    for layer in layers:
+        merged = merge(merged, layer)
+    unknown = sorted(set(merged) - _TOP)
+    if unknown:
+        raise CorrmatError(f"{path}: unknown key {unknown[0]!r}; known: {', '.join(sorted(_TOP))}")
+    chosen = merged["arms"] if arms is None else {a: merged["arms"].get(a) for a in arms}
+    settings = {}
+    for arm, own in chosen.items():
+        if arm not in METHODS or arm not in merged["arms"]:
+            raise CorrmatError(f"{path}: unknown arm {arm!r}; known: {', '.join(merged['arms'])}")
+        common = {key: merged[key] for key in ("seed", *GROUPS) if key in merged}
+        settings[arm] = _parse(arm, merge(common, own or {}), options, path)
+    return Recipe(
+        id=str(merged["id"]),
+        title=merged["title"],
+        scale=scale,
+        paper=merged.get("paper", {}),
+        settings=settings,
+        bands_deg=tuple(merged.get("bands_deg", ())),
+        networks_of=merged.get("networks_of"),
+    )
+
+
+def parser(arm: str, prog: str = "corrmat") -> ArgumentParser:
+    """The typed settings of one arm as command-line options."""
+    found = ArgumentParser(prog=prog, exit_on_error=False, add_help=False)
+    found.add_argument("--seed", type=int, default=0, help="of weights, pairs and held-out shapes")
+    found.add_class_arguments(RegistrationDataModule, "data", skip={"seed"})
+    found.add_class_arguments(METHODS[arm].network_type, "network")
+    found.add_class_arguments(OptimizerSettings, "optimizer")
+    found.add_class_arguments(L.Trainer, "trainer", skip=_NOT_TRAINER, instantiate=False)
+    return found
+
+
+def merge(under: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """Dictionaries merged key by key; everything else is replaced."""
+    merged = dict(under)
+    for key, value in over.items():
+        both = isinstance(value, dict) and isinstance(merged.get(key), dict)
+        merged[key] = merge(merged[key], value) if both else value
+    return merged
+
+
+def _parse(arm: str, settings: dict[str, Any], options: list[str], path: Path) -> Namespace:
+    typed = parser(arm)
+    # Both error types are jsonargparse's; either way the first line says what is wrong.
+    try:
+        under = typed.parse_object(settings)
+    except Exception as error:  # noqa: BLE001
+        raise CorrmatError(f"{path}: {_first_line(error)}") from error
+    try:
+        return typed.parse_args(options, namespace=under)
+    except Exception as error:  # noqa: BLE001
+        raise CorrmatError(f"{_first_line(error)} (corrmat fit --help lists the options)") from error
+
+
+def _first_line(error: Exception) -> str:
+    lines = [line.strip(" -") for line in str(error).splitlines() if line.strip(" -")]
+    return " ".join(lines[:2])
+
+
+def _scale(recipe: dict[str, Any], scale: str) -> dict[str, Any]:
+    return recipe.get("scales", {}).get(scale) or {}
+
+
+def _read(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise CorrmatError(f"no recipe {path}; see configs/exp/")
+    try:
+        content = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        raise CorrmatError(f"{path} is not YAML: {_first_line(error)}") from error
+    if not isinstance(content, dict):
+        raise CorrmatError(f"{path} holds no settings")
+    return content
