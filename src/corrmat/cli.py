@@ -46,17 +46,24 @@ def _command(words: list[str]) -> int:
     )
     commands = parser.add_subparsers(dest="command", metavar="command", required=True)
     for name, purpose in (
-        ("run", "train and test both arms of an experiment, write a record, print it beside the paper's"),
+        (
+            "run",
+            "train and test both arms of an experiment, write a record, print it beside the paper's",
+        ),
         ("fit", "train one arm"),
         ("evaluate", "test the checkpoint of one arm"),
     ):
-        command = commands.add_parser(name, help=purpose, description=purpose, add_help=False, allow_abbrev=False)
+        command = commands.add_parser(
+            name, help=purpose, description=purpose, add_help=False, allow_abbrev=False
+        )
         _experiment_options(command, name)
     data = commands.add_parser("data", help="make the embedded data set, draw its families")
     data.add_argument("--sheet", type=Path, metavar="PNG", help="draw one shape of every family")
     report = commands.add_parser("report", help="rewrite the tables of the documents from results/")
     report.add_argument("--results", type=Path, default=Path("results"), help="folder of records")
-    report.add_argument("--readme", type=Path, default=Path("README.md"), help="where the table goes")
+    report.add_argument(
+        "--readme", type=Path, default=Path("README.md"), help="where the table goes"
+    )
     known, options = parser.parse_known_args(words)
     if known.command == "data":
         _refuse(options)
@@ -70,14 +77,22 @@ def _command(words: list[str]) -> int:
 def _experiment_options(command: argparse.ArgumentParser, name: str) -> None:
     command.add_argument("--help", "-h", action="store_true", help="show every option and its type")
     command.add_argument("--config", type=Path, help="the experiment, e.g. configs/exp/1.1.yaml")
-    command.add_argument("--scale", default="laptop", choices=["smoke", "laptop", "paper"], help="default: laptop")
-    command.add_argument("--runs", type=Path, default=Path("runs"), help="folder of checkpoints and logs")
+    command.add_argument(
+        "--scale", default="laptop", choices=["smoke", "laptop", "paper"], help="default: laptop"
+    )
+    command.add_argument(
+        "--runs", type=Path, default=Path("runs"), help="folder of checkpoints and logs"
+    )
     if name == "run":
-        command.add_argument("--results", type=Path, default=Path("results"), help="folder of records")
+        command.add_argument(
+            "--results", type=Path, default=Path("results"), help="folder of records"
+        )
     else:
         command.add_argument("--arm", default="DCP_corr", help="DCP or DCP_corr (default)")
     if name == "evaluate":
-        command.add_argument("--checkpoint", type=Path, help="default: best.ckpt of the arm's last fit or run")
+        command.add_argument(
+            "--checkpoint", type=Path, help="default: best.ckpt of the arm's last fit or run"
+        )
     command.set_defaults(usage_text=command.format_help())
 
 
@@ -92,6 +107,7 @@ def _experiment(known: argparse.Namespace, options: list[str]) -> int:
     if known.config is None:
         raise CorrmatError("which experiment? --config configs/exp/1.1.yaml")
     arms = None if known.command == "run" else [known.arm]
+    experiment.quieten()
     found = recipe.load(known.config, known.scale, options, arms)
     if known.command == "run":
         experiment.run(found, known.results, known.runs)
@@ -99,7 +115,9 @@ def _experiment(known: argparse.Namespace, options: list[str]) -> int:
     settings = found.settings[known.arm]
     folder = known.runs / found.scale / found.data / found.id / known.arm
     if known.command == "fit":
-        trained = experiment.train(known.arm, settings, folder, group=f"{found.scale}/{found.data}/{found.id}")
+        trained = experiment.train(
+            known.arm, settings, folder, group=f"{found.scale}/{found.data}/{found.id}"
+        )
         print(f"best checkpoint: {trained.checkpoint}")
         return 0
     checkpoint = known.checkpoint or folder / "best.ckpt"
@@ -114,7 +132,9 @@ def _data(sheet: Path | None) -> int:
 
     for split in shapes.SIZE:
         clouds = shapes.load(split)
-        print(f"{split}: {len(clouds)} shapes of {len(clouds.names)} families in {shapes.cache_folder()}")
+        print(
+            f"{split}: {len(clouds)} shapes of {len(clouds.names)} families in {shapes.cache_folder()}"
+        )
     if sheet is not None:
         from corrmat.data.sheet import draw
 

@@ -2,11 +2,13 @@
 
 import csv
 import json
+import logging
 import os
 import shutil
 import subprocess
 import sys
 import time
+import warnings
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -102,7 +104,9 @@ def train(arm: str, settings: Settings, folder: Path, group: str = "") -> Traine
     stored = folder / "settings.yaml"
     text = yaml.safe_dump(training_settings(settings), sort_keys=False)
     last, done = folder / "last.ckpt", folder / "trained.json"
-    resume = last.is_file() and not done.is_file() and stored.is_file() and stored.read_text() == text
+    resume = (
+        last.is_file() and not done.is_file() and stored.is_file() and stored.read_text() == text
+    )
     if not resume:
         shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True, exist_ok=True)
@@ -111,18 +115,28 @@ def train(arm: str, settings: Settings, folder: Path, group: str = "") -> Traine
     L.seed_everything(settings.seed, workers=True, verbose=False)
     module = make_module(arm, settings)
     curve = Curve(datamodule.batch_size)
-    best = ModelCheckpoint(folder, "best", monitor=BEST, save_last=True, enable_version_counter=False)
+    best = ModelCheckpoint(
+        folder, "best", monitor=BEST, save_last=True, enable_version_counter=False
+    )
     trainer = make_trainer(settings, folder, [curve, best, SaveOnInterrupt(last)], arm, group)
     if resume:
         say(f"going on from {last}")
     elif trainer.is_global_zero:
-        say(f"{sum(p.numel() for p in module.parameters()):,} parameters, {len(datamodule.clouds('train'))} training shapes")
+        say(
+            f"{sum(p.numel() for p in module.parameters()):,} parameters, {len(datamodule.clouds('train'))} training shapes"
+        )
     trainer.fit(module, datamodule, ckpt_path=last if resume else None, weights_only=True)
     for logger in trainer.loggers:
         if isinstance(logger, WandbLogger):
             logger.experiment.finish()
-    trained = Trained(Path(best.best_model_path), curve.pairs, curve.seconds, commit(), curve.points)
-    replace_text(done, json.dumps(asdict(trained) | {"checkpoint": trained.checkpoint.name}, indent=1))
+    checkpoint = folder / "best.ckpt"
+    if not checkpoint.is_file():
+        say("training ended before the first validation: the last weights stand for the best")
+        trainer.save_checkpoint(checkpoint)
+    trained = Trained(checkpoint, curve.pairs, curve.seconds, commit(), curve.points)
+    replace_text(
+        done, json.dumps(asdict(trained) | {"checkpoint": trained.checkpoint.name}, indent=1)
+    )
     return trained
 
 
@@ -158,9 +172,22 @@ def make_datamodule(settings: Settings) -> RegistrationDataModule:
 
 
 def make_module(arm: str, settings: Settings) -> RegistrationModule:
-    """The method of these settings, freshly initialised."""
+    """The method of these settings, freshly initialised.
+
+    Raises:
+        CorrmatError: the network cannot be built so, or the clouds are too small for it.
+    """
     method = METHODS[arm]
-    network = method.network_type(**settings.network.as_dict())
+    try:
+        network = method.network_type(**settings.network.as_dict())
+    except ValueError as error:
+        raise CorrmatError(f"no network of these --network options: {error}") from error
+    points = make_datamodule(settings).how.num_source
+    if points < network.min_points:
+        raise CorrmatError(
+            f"a source of {points} points is too small for {arm}, which needs {network.min_points}; "
+            "raise --data.num_points or lower --network.k"
+        )
     return method(network, OptimizerSettings(**settings.optimizer.as_dict()))
 
 
@@ -175,9 +202,21 @@ def load_weights(module: RegistrationModule, checkpoint: Path) -> None:
     try:
         state = torch.load(checkpoint, map_location="cpu", weights_only=True)["state_dict"]
         module.load_state_dict(state)
-    except Exception as error:  # noqa: BLE001 (torch raises many types for a damaged file)
+    except Exception as error:
         first = str(error).splitlines()[0]
         raise CorrmatError(f"{checkpoint} does not fit these settings: {first}") from error
+
+
+def quieten() -> None:
+    """Keep Lightning's hints and the deprecations inside libraries off the user's screen."""
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    for message in (
+        "isinstance.treespec, LeafSpec",
+        "Checkpoint directory",
+        ".*does not have many workers",
+    ):
+        warnings.filterwarnings("ignore", message=f".*{message}")
 
 
 def make_trainer(
@@ -207,7 +246,9 @@ def trainer_options(settings: Settings) -> dict[str, Any]:
 def training_settings(settings: Settings) -> dict[str, Any]:
     """What decides how an arm is trained: everything but where the data lies and what is tested."""
     plain = report.plain(settings.as_dict())
-    return plain | {"data": {k: v for k, v in plain["data"].items() if k not in ("root", "test_shapes")}}
+    return plain | {
+        "data": {k: v for k, v in plain["data"].items() if k not in ("root", "test_shapes")}
+    }
 
 
 def commit() -> str | None:
@@ -215,7 +256,9 @@ def commit() -> str | None:
     here = Path(__file__).parent
 
     def git(*words: str) -> str:
-        return subprocess.run(["git", *words], cwd=here, capture_output=True, text=True, check=True).stdout
+        return subprocess.run(
+            ["git", *words], cwd=here, capture_output=True, text=True, check=True
+        ).stdout
 
     try:
         changed = git("status", "--porcelain", "--", here)
@@ -239,7 +282,12 @@ class Curve(Callback):
         self._since = time.monotonic()
 
     def on_train_batch_end(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: PairBatch, batch_idx: int  # noqa: ANN401
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: Any,
+        batch: PairBatch,
+        batch_idx: int,
     ) -> None:
         """Count."""
         self.pairs += len(batch)
@@ -250,10 +298,20 @@ class Curve(Callback):
         if trainer.sanity_checking or not self._losses:
             return
         self._tick()
-        values = {k.removeprefix("val/"): float(v) for k, v in trainer.callback_metrics.items() if k.startswith("val/")}
+        values = {
+            k.removeprefix("val/"): float(v)
+            for k, v in trainer.callback_metrics.items()
+            if k.startswith("val/")
+        }
         loss = float(torch.stack(self._losses).mean())
         self._losses.clear()
-        shown = ("match_accuracy", "rotation_error_deg_mean", "rotation_error_deg_median", "relative_euler_rmse_deg", "translation_rmse")
+        shown = (
+            "match_accuracy",
+            "rotation_error_deg_mean",
+            "rotation_error_deg_median",
+            "relative_euler_rmse_deg",
+            "translation_rmse",
+        )
         self.points.append({"pairs_seen": self.pairs, "loss": loss} | {k: values[k] for k in shown})
         line = (
             f"step {trainer.global_step:6d}  {self.pairs:7,d} pairs  {self.seconds:5.0f} s  loss {loss:7.4f}  "
@@ -288,11 +346,15 @@ class SaveOnInterrupt(Callback):
     def __init__(self, path: Path) -> None:
         self.path = path
 
-    def on_exception(self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException) -> None:
+    def on_exception(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException
+    ) -> None:
         """Lightning calls this before it gives up."""
         if isinstance(exception, KeyboardInterrupt):
             trainer.save_checkpoint(self.path)
-            say(f"interrupted at step {trainer.global_step}; saved {self.path}; the same command goes on from there")
+            say(
+                f"interrupted at step {trainer.global_step}; saved {self.path}; the same command goes on from there"
+            )
 
 
 def say(text: str) -> None:
@@ -310,7 +372,10 @@ def replace_text(path: Path, text: str) -> None:
 def _wandb(folder: Path, arm: str, group: str, mode: str, settings: Settings) -> WandbLogger:
     import wandb  # starts slowly, and not everybody wants it
 
-    quiet = wandb.Settings(silent=True, console="off", disable_git=True, save_code=False, x_disable_stats=True)
+    os.environ.setdefault("WANDB_SILENT", "true")  # else it talks before it reads its settings
+    quiet = wandb.Settings(
+        silent=True, console="off", disable_git=True, save_code=False, x_disable_stats=True
+    )
     logger = WandbLogger(
         project="corrmat", name=f"{group}/{arm}", group=group, job_type=arm, save_dir=folder,
         offline=mode != "online", settings=quiet,
@@ -363,7 +428,9 @@ def _rows(arm: str, band: int, found: dict[str, Tensor]) -> list[dict[str, Any]]
     ]
 
 
-def _write(folder: Path, record: dict[str, Any], recipe: Recipe, rows: list[dict[str, Any]]) -> None:
+def _write(
+    folder: Path, record: dict[str, Any], recipe: Recipe, rows: list[dict[str, Any]]
+) -> None:
     """Write all files of a record beside its place, then move them in, metrics.json last."""
     partial = folder.with_name(f".{folder.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
@@ -375,7 +442,9 @@ def _write(folder: Path, record: dict[str, Any], recipe: Recipe, rows: list[dict
     settings = {arm: report.plain(s.as_dict()) for arm, s in recipe.settings.items()}
     for own in settings.values():
         own["data"].pop("root")  # where the data lies is nobody else's business
-    (partial / "config.yaml").write_text(yaml.safe_dump({"id": recipe.id, "scale": recipe.scale, "arms": settings}, sort_keys=False))
+    (partial / "config.yaml").write_text(
+        yaml.safe_dump({"id": recipe.id, "scale": recipe.scale, "arms": settings}, sort_keys=False)
+    )
     report.curves_figure(record, partial / "curves.png")
     (partial / "metrics.json").write_text(json.dumps(record, indent=1) + "\n")
     folder.mkdir(parents=True, exist_ok=True)

@@ -201,5 +201,7 @@ def _euler_deg(rotation: Tensor) -> Tensor:
 
 @torch.no_grad()
 def _nearest_squared(points: Tensor, cloud: Tensor) -> Tensor:
-    distance = torch.cdist(points.double(), cloud.double(), compute_mode="donot_use_mm_for_euclid_dist")
+    distance = torch.cdist(
+        points.double(), cloud.double(), compute_mode="donot_use_mm_for_euclid_dist"
+    )
     return distance.amin(-1).square()

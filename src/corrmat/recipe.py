@@ -20,7 +20,18 @@ from corrmat.module import OptimizerSettings
 
 SCALES = ("smoke", "laptop", "paper")
 GROUPS = ("data", "network", "optimizer", "trainer")
-_TOP = {"id", "title", "paper", "arms", "scales", "bands_deg", "networks_of", "base", "seed", *GROUPS}
+_TOP = {
+    "id",
+    "title",
+    "paper",
+    "arms",
+    "scales",
+    "bands_deg",
+    "networks_of",
+    "base",
+    "seed",
+    *GROUPS,
+}
 _NOT_TRAINER = {"logger", "callbacks", "default_root_dir", "plugins", "profiler", "model_registry"}
 
 
@@ -106,12 +117,14 @@ def _parse(arm: str, settings: dict[str, Any], options: list[str], path: Path) -
     # Both error types are jsonargparse's; either way the first line says what is wrong.
     try:
         under = typed.parse_object(settings)
-    except Exception as error:  # noqa: BLE001
+    except Exception as error:
         raise CorrmatError(f"{path}: {_first_line(error)}") from error
     try:
         return typed.parse_args(options, namespace=under)
-    except Exception as error:  # noqa: BLE001
-        raise CorrmatError(f"{_first_line(error)} (corrmat fit --help lists the options)") from error
+    except Exception as error:
+        raise CorrmatError(
+            f"{_first_line(error)} (corrmat fit --help lists the options)"
+        ) from error
 
 
 def _first_line(error: Exception) -> str:

@@ -27,13 +27,26 @@ PANELS = {
     "translation_rmse": "translation RMSE",
 }
 COLOURS = ("#d62728", "#1f77b4")  # METHOD red, METHOD_corr blue, as in the paper's figures
-README_METRICS = ("match_accuracy", "relative_euler_rmse_deg", "rotation_error_deg_median", "translation_rmse")
+README_METRICS = (
+    "match_accuracy",
+    "relative_euler_rmse_deg",
+    "rotation_error_deg_median",
+    "translation_rmse",
+)
 
 
 def table(record: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
     """Ours beside the paper's: headings and rows of text, one row a metric (and a band)."""
     first, second = record["arms"]
-    heads = ["", f"{first}", f"{second}", "ratio", f"paper {first}", f"paper {second}", "paper ratio"]
+    heads = [
+        "",
+        f"{first}",
+        f"{second}",
+        "ratio",
+        f"paper {first}",
+        f"paper {second}",
+        "paper ratio",
+    ]
     rows = []
     for name, (label, style, factor) in METRICS.items():
         ours = [_value(record["arms"][arm], name) for arm in (first, second)]
@@ -57,7 +70,9 @@ def terminal_table(record: Mapping[str, Any]) -> str:
 
     def line(cells: Sequence[str]) -> str:
         first, *rest = cells
-        return "  ".join([first.ljust(widths[0]), *(c.rjust(w) for c, w in zip(rest, widths[1:], strict=True))])
+        return "  ".join(
+            [first.ljust(widths[0]), *(c.rjust(w) for c, w in zip(rest, widths[1:], strict=True))]
+        )
 
     effort = "; ".join(
         f"{arm}: {found['pairs_seen']:,} pairs in {found['train_seconds'] / 60:.1f} min"
@@ -75,7 +90,9 @@ def markdown_summary(records: Sequence[Mapping[str, Any]]) -> str:
         for arm, found in record["arms"].items():
             cells = [_cell(_value(found, name), *METRICS[name][1:]) for name in README_METRICS]
             minutes = f"{found['train_seconds'] / 60:.1f}"
-            lines.append(_row([f"{record['id']} {record['scale']}", record["data"], arm, *cells, minutes]))
+            lines.append(
+                _row([f"{record['id']} {record['scale']}", record["data"], arm, *cells, minutes])
+            )
         for arm, found in record["paper"].items():
             cells = [_cell(_value(found, name), *METRICS[name][1:]) for name in README_METRICS]
             if any(cells):
@@ -124,10 +141,14 @@ def curves_figure(record: Mapping[str, Any], path: Path) -> None:
         for arm, colour in zip(record["arms"], COLOURS, strict=False):
             curve = record["arms"][arm]["curve"]
             seen = [point["pairs_seen"] for point in curve]
-            axes.plot(seen, [factor * point[name] for point in curve], color=colour, marker=".", label=arm)
+            axes.plot(
+                seen, [factor * point[name] for point in curve], color=colour, marker=".", label=arm
+            )
             final = _value(record["paper"].get(arm, {}), name)
             if final is not None:
-                axes.axhline(factor * final, color=colour, linestyle=":", linewidth=1, label=f"paper, {arm}")
+                axes.axhline(
+                    factor * final, color=colour, linestyle=":", linewidth=1, label=f"paper, {arm}"
+                )
         if name in ("relative_euler_rmse_deg", "translation_rmse"):
             axes.set_yscale("log")
         axes.set(title=title, xlabel="training pairs seen")

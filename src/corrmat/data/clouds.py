@@ -74,12 +74,16 @@ def read_hdf5(path: Path, names: tuple[str, ...]) -> CloudSet:
         raise CorrmatError(
             f"{path}: data {points.shape} and normal {normals.shape} are not both (S, P, 3)"
         )
-    if len(labels) != len(points) or (len(labels) and not 0 <= labels.min() <= labels.max() < len(names)):
+    if len(labels) != len(points) or (
+        len(labels) and not 0 <= labels.min() <= labels.max() < len(names)
+    ):
         raise CorrmatError(f"{path}: labels do not fit {len(points)} shapes of {len(names)} names")
     for array, kind in ((points, "points"), (normals, "normals")):
         bad = np.flatnonzero(~np.isfinite(array).all((1, 2)))
         if len(bad):
-            raise CorrmatError(f"{path}: shape {bad[0]} has NaN or infinite {kind}; remove or mend it")
+            raise CorrmatError(
+                f"{path}: shape {bad[0]} has NaN or infinite {kind}; remove or mend it"
+            )
     return CloudSet(np.concatenate([points, normals], -1), labels, names)
 
 

@@ -58,7 +58,8 @@ class PairSettings:
     def __post_init__(self) -> None:
         checks = {
             "num_points": self.num_points >= 3,
-            "rotation_deg": 0 <= self.min_rotation_deg <= self.rotation_deg <= 180,
+            "rotation_deg": 0 <= self.rotation_deg <= 180,
+            "min_rotation_deg": 0 <= self.min_rotation_deg <= self.rotation_deg,
             "translation": self.translation >= 0,
             "keep": 0 < self.keep <= 1 and round(self.keep * self.num_points) >= 3,
             "jitter": self.jitter >= 0,
@@ -99,7 +100,9 @@ class _Draw(NamedTuple):
     outlier_at: np.ndarray  # (..., 6) what they become
 
 
-def make_pairs(clouds: CloudSet, shapes: Sequence[int], keys: Sequence[Key], how: PairSettings) -> PairBatch:
+def make_pairs(
+    clouds: CloudSet, shapes: Sequence[int], keys: Sequence[Key], how: PairSettings
+) -> PairBatch:
     """Draw one pair of each shape.
 
     Args:

@@ -70,7 +70,11 @@ def build(path: Path, split: str) -> None:
     partial = path.with_suffix(f".{os.getpid()}.partial")
     try:
         with h5py.File(partial, "w") as file:
-            file["data"], file["normal"], file["label"] = clouds.points, clouds.normals, clouds.labels
+            file["data"], file["normal"], file["label"] = (
+                clouds.points,
+                clouds.normals,
+                clouds.labels,
+            )
             file.attrs["version"] = fingerprint()
             file.attrs["sha256"] = _digest(clouds)
         partial.replace(path)

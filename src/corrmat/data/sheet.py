@@ -11,7 +11,9 @@ from corrmat.data.clouds import CloudSet
 def draw(clouds: CloudSet, path: Path, columns: int = 8) -> None:
     """Write a PNG with the first shape of each category, seen from one corner, shaded by normal."""
     found = [np.flatnonzero(clouds.labels == label) for label in range(len(clouds.names))]
-    shown = [(name, index[0]) for name, index in zip(clouds.names, found, strict=True) if len(index)]
+    shown = [
+        (name, index[0]) for name, index in zip(clouds.names, found, strict=True) if len(index)
+    ]
     rows = -(-len(shown) // columns)
     figure = Figure(figsize=(1.9 * columns, 2.0 * rows), layout="constrained")
     light = np.array([0.4, -0.7, 0.6]) / np.linalg.norm([0.4, -0.7, 0.6])

@@ -34,6 +34,7 @@ class DCPNetwork(nn.Module):
         k: int = 20,
     ) -> None:
         super().__init__()
+        self.min_points = k
         self.embed = DGCNN(width, edge_channels, k)
         self.pointer = Transformer(width, heads, feedforward) if pointer == "transformer" else None
 

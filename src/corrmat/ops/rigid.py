@@ -21,9 +21,7 @@ def apply(rotation: Tensor, translation: Tensor, points: Tensor) -> Tensor:
     return points @ rotation.mT + translation.unsqueeze(-2)
 
 
-def compose(
-    outer: tuple[Tensor, Tensor], inner: tuple[Tensor, Tensor]
-) -> tuple[Tensor, Tensor]:
+def compose(outer: tuple[Tensor, Tensor], inner: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     """The motion that applies `inner` first and `outer` second; each is ((..., 3, 3), (..., 3))."""
     rotation, translation = outer
     return rotation @ inner[0], apply(rotation, translation, inner[1].unsqueeze(-2)).squeeze(-2)
@@ -67,7 +65,8 @@ def procrustes(
             to zero is treated as one without points: identity rotation.
 
     Returns:
-        rotation (B, 3, 3) and translation (B, 3), in the dtype of `source`.
+        rotation (B, 3, 3) and translation (B, 3), in the dtype of `source`. NaN where a
+        pair's points or weights are not finite; the other pairs are not touched by it.
     """
     x, y = source.double(), target.double()
     if weight is None:
@@ -106,10 +105,12 @@ class _RotationFromCovariance(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, covariance: Tensor) -> Tensor:  # noqa: ANN001
-        u, s, vh = torch.linalg.svd(covariance)
+        finite = covariance.isfinite().all(-1).all(-1)[..., None, None]
+        identity = torch.eye(3, dtype=covariance.dtype, device=covariance.device)
+        u, s, vh = torch.linalg.svd(torch.where(finite, covariance, identity))
         sign = torch.det(vh.mT @ u.mT).sign()
         flip = torch.stack([torch.ones_like(sign), torch.ones_like(sign), sign], -1)
-        rotation = (vh.mT * flip.unsqueeze(-2)) @ u.mT
+        rotation = torch.where(finite, (vh.mT * flip.unsqueeze(-2)) @ u.mT, torch.nan)
         ctx.save_for_backward(rotation, vh, s * flip)
         return rotation
 

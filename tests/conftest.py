@@ -1,0 +1,49 @@
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+ROOT = Path(__file__).resolve().parents[1]
+SHARED = Path(os.environ.get("CORRMAT_SHARED", ROOT.parent / "shared"))
+
+torch.set_num_threads(1)  # tensors here are tiny, and a second thread only waits
+
+
+def shared(*parts: str) -> Path:
+    """A file outside the project that a test compares with; the test is skipped without it."""
+    path = SHARED.joinpath(*parts)
+    if not path.exists():
+        pytest.skip(f"{path.name} is not at hand")
+    return path
+
+
+def golden(name: str) -> tuple[dict[str, torch.Tensor], dict]:
+    """Arrays of a reference implementation and their hyper-parameters."""
+    arrays = np.load(shared("golden", f"{name}.npz"))
+    description = SHARED / "golden" / f"{name}.json"
+    hparams = json.loads(description.read_text()) if description.exists() else {}
+    return {key: torch.from_numpy(np.asarray(arrays[key])) for key in arrays}, hparams
+
+
+def state_of(arrays: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    return {k.removeprefix("state/"): v for k, v in arrays.items() if k.startswith("state/")}
+
+
+@pytest.fixture(autouse=True)
+def _quiet_and_offline(monkeypatch, tmp_path):
+    monkeypatch.setenv("WANDB_MODE", "disabled")
+    monkeypatch.setenv("CORRMAT_CACHE", str(tmp_path / "cache"))
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(0)
+
+
+def random_rotation(batch: int, generator: torch.Generator) -> torch.Tensor:
+    q, r = torch.linalg.qr(torch.randn(batch, 3, 3, generator=generator, dtype=torch.float64))
+    q = q * r.diagonal(dim1=1, dim2=2).sign().unsqueeze(1)
+    return q * torch.det(q).view(-1, 1, 1)

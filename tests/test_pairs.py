@@ -1,0 +1,213 @@
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from corrmat.data.clouds import CloudSet
+from corrmat.data.datamodule import RegistrationDataModule
+from corrmat.data.pairs import Key, PairSettings, generator, make_pairs
+from corrmat.errors import CorrmatError
+from corrmat.ops import rigid
+
+
+@pytest.fixture(scope="module")
+def clouds():
+    rng = np.random.default_rng(0)
+    normals = rng.standard_normal((5, 128, 3)).astype(np.float32)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    points = rng.uniform(-0.6, 0.6, (5, 128, 3)).astype(np.float32)
+    return CloudSet(np.concatenate([points, normals], -1), np.zeros(5, np.int64), ("thing",))
+
+
+def pairs_of(clouds, epoch=0, **how):
+    keys = [Key(0, 0, epoch, i) for i in range(len(clouds))]
+    return make_pairs(clouds, range(len(clouds)), keys, PairSettings(**{"num_points": 40} | how))
+
+
+def aligned(pairs):
+    return rigid.apply(pairs.rotation, pairs.translation, pairs.source[..., :3])
+
+
+def matched(pairs):
+    index = pairs.match.clamp_max(pairs.target.shape[1] - 1).unsqueeze(-1).expand(-1, -1, 6)
+    return torch.gather(pairs.target, 1, index)
+
+
+@pytest.mark.parametrize("keep", [1.0, 0.7])
+def test_the_true_motion_takes_each_point_and_normal_onto_its_match(clouds, keep):
+    pairs = pairs_of(clouds, keep=keep)
+    assert pairs.source.shape == (5, round(keep * 40), 6)
+    assert pairs.target.shape == (5, 40, 6)
+    torch.testing.assert_close(aligned(pairs), matched(pairs)[..., :3], atol=1e-6, rtol=0)
+    normals = pairs.source[..., 3:] @ pairs.rotation.mT
+    torch.testing.assert_close(normals, matched(pairs)[..., 3:], atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(
+    "how", [{}, {"keep": 0.7}, {"sampling": "independent"}, {"sampling": "disjoint"}]
+)
+def test_the_match_is_the_nearest_target_point(clouds, how):
+    pairs = pairs_of(clouds, **how)
+    nearest = torch.cdist(aligned(pairs), pairs.target[..., :3]).argmin(-1)
+    assert torch.equal(pairs.match, nearest)
+
+
+def test_sampling_shares_all_some_or_no_points(clouds):
+    def shared(sampling):
+        pairs = pairs_of(clouds, num_points=60, sampling=sampling)
+        distance = torch.cdist(aligned(pairs).double(), pairs.target[..., :3].double()).amin(-1)
+        return (distance < 1e-5).float().mean()
+
+    assert shared("identical") == 1
+    assert 0.3 < shared("independent") < 0.7
+    assert shared("disjoint") == 0
+
+
+def test_target_order_is_shuffled(clouds):
+    pairs = pairs_of(clouds)
+    assert not (pairs.match == torch.arange(40)).all(1).any()
+
+
+def test_a_crop_leaves_one_side_of_a_plane_through_the_centroid(clouds):
+    """What is left and what is gone are separated by a plane; counts are exact."""
+    from scipy.optimize import linprog
+
+    pairs = pairs_of(clouds, keep=0.7)
+    assert pairs.source.shape[1] == 28
+    full = torch.gather(
+        pairs.target[..., :3], 1, torch.arange(40).expand(5, -1).unsqueeze(-1).expand(-1, -1, 3)
+    )
+    for b in range(5):
+        kept = torch.zeros(40, dtype=torch.bool)
+        kept[pairs.match[b]] = True
+        sign = torch.where(kept, 1.0, -1.0)[:, None]
+        rows = -sign * torch.cat([full[b], torch.ones(40, 1)], 1)
+        assert linprog(np.zeros(4), rows.numpy(), -np.ones(40), bounds=(None, None)).success
+
+
+def test_angles_and_translations_stay_in_their_range_and_fill_it(clouds):
+    def angles(**how):
+        drawn = torch.cat([pairs_of(clouds, epoch, **how).rotation for epoch in range(60)])
+        cosine = (drawn.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
+        return torch.rad2deg(torch.acos(cosine.clamp(-1, 1)))
+
+    assert 40 < angles(rotation_deg=45.0).max() <= 45.1
+    band = angles(min_rotation_deg=120.0, rotation_deg=150.0)
+    assert 119.9 < band.min() < 123
+    assert 147 < band.max() < 150.1
+    assert angles(rotation_deg=180.0).mean() == pytest.approx(90, abs=8)
+    shifts = torch.cat([pairs_of(clouds, epoch).translation for epoch in range(60)])
+    assert 0.48 < shifts.abs().max() <= 0.5
+    assert (pairs_of(clouds, translation=0.0).translation == 0).all()
+
+
+def test_jitter_moves_both_clouds_and_not_the_truth(clouds):
+    clean, noisy = pairs_of(clouds), pairs_of(clouds, jitter=0.01)
+    assert torch.equal(clean.match, noisy.match)
+    for name in ("source", "target"):
+        spread = (getattr(noisy, name) - getattr(clean, name))[..., :3].std()
+        assert spread == pytest.approx(0.01, rel=0.15)
+
+
+def test_outliers_are_replaced_labelled_and_otherwise_nothing_changes(clouds):
+    clean, dirty = pairs_of(clouds), pairs_of(clouds, outliers=0.2, outlier_distance=0.02)
+    replaced = (clean.source != dirty.source).any(-1)
+    assert (replaced.sum(1) == 8).all()
+    assert dirty.source[replaced][:, :3].abs().max() <= 0.5
+    distance = torch.cdist(aligned(dirty), dirty.target[..., :3]).amin(-1)
+    assert torch.equal(dirty.match == 40, distance > 0.02)
+    assert torch.equal(dirty.match[~replaced], clean.match[~replaced])
+
+
+def test_settings_that_are_off_do_not_shift_those_that_are_on(clouds):
+    plain, cropped = pairs_of(clouds), pairs_of(clouds, keep=0.5, rotation_deg=90.0)
+    assert torch.equal(plain.translation, cropped.translation)
+
+
+def test_keys_that_differ_in_one_place_draw_differently():
+    keys = [Key(0, 0, 0, 0), Key(1, 0, 0, 0), Key(0, 1, 0, 0), Key(0, 0, 1, 0), Key(0, 0, 0, 1)]
+    assert len({generator(key).random() for key in keys}) == 5
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"keep": 0.0}, {"keep": 1.2}, {"num_points": 2}, {"rotation_deg": 200.0}, {"jitter": -1.0},
+        {"min_rotation_deg": 181.0}, {"translation": -0.1}, {"outliers": 1.0}, {"outlier_distance": 0.0},
+    ],
+)  # fmt: skip
+def test_settings_out_of_range_are_named(change):
+    with pytest.raises(CorrmatError, match=next(iter(change))):
+        PairSettings(**change)
+
+
+def datamodule(**how):
+    return RegistrationDataModule(
+        num_points=32, batch_size=5, train_shapes=24, test_shapes=7, **how
+    )
+
+
+def all_items(loader):
+    return [dataclasses.astuple(batch) for batch in loader]
+
+
+@pytest.mark.parametrize("split", ["train", "val", "test"])
+def test_batches_are_equal_for_any_number_of_workers(split):
+    found = []
+    for workers in (0, 2):
+        loader = getattr(datamodule(num_workers=workers), f"{split}_dataloader")()
+        loader.sampler.set_epoch(3)
+        found.append(all_items(loader))
+    assert len(found[0]) == len(found[1]) > 0
+    for one, two in zip(*found, strict=True):
+        assert all(torch.equal(a, b) for a, b in zip(one, two, strict=True))
+
+
+def test_test_pairs_are_frozen_and_training_pairs_are_not():
+    data = datamodule()
+    test, train = data.test_dataloader(), data.train_dataloader()
+    first, again = all_items(test), all_items(test)
+    test.sampler.set_epoch(5)
+    later = all_items(test)
+    assert all(
+        torch.equal(a[0], b[0]) and torch.equal(a[0], c[0])
+        for a, b, c in zip(first, again, later, strict=True)
+    )
+    zero = all_items(train)
+    train.sampler.set_epoch(1)
+    assert not any(torch.equal(a[0], b[0]) for a, b in zip(zero, all_items(train), strict=True))
+
+
+def test_a_pair_does_not_depend_on_its_batch():
+    one, many = datamodule(), datamodule()
+    one.batch_size = 1
+    single = [dataclasses.astuple(b) for b in one.test_dataloader()]
+    for position, batch in enumerate(
+        b for big in many.test_dataloader() for b in zip(*dataclasses.astuple(big), strict=True)
+    ):
+        for a, b in zip(single[position], batch, strict=True):
+            torch.testing.assert_close(a[0], b, rtol=1e-6, atol=1e-6)
+
+
+def test_a_tenth_of_train_is_held_out_by_seed():
+    splits = [datamodule(seed=seed) for seed in (0, 0, 1)]
+    held = [{row.tobytes() for row in s.clouds("val").rows} for s in splits]
+    kept = {row.tobytes() for row in splits[0].clouds("train").rows}
+    assert len(held[0]) == 2
+    assert len(kept) == 22
+    assert not held[0] & kept
+    assert held[0] == held[1] != held[2]
+
+
+def test_too_few_points_are_an_error_that_says_how_many():
+    with pytest.raises(
+        CorrmatError, match="have 2048 points, but disjoint pairs of num_points = 1500 need 3000"
+    ):
+        RegistrationDataModule(
+            num_points=1500, sampling="disjoint", test_shapes=2
+        ).test_dataloader()
+    with pytest.raises(CorrmatError, match="at least 2 shapes"):
+        RegistrationDataModule(train_shapes=1).train_dataloader()
+    with pytest.raises(CorrmatError, match="test split has 800 shapes, 801 were asked for"):
+        RegistrationDataModule(test_shapes=801).test_dataloader()

@@ -1,0 +1,63 @@
+"""Naive twins: the plainest code that computes the same as a fast path."""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from corrmat.networks.dgcnn import FoldedNormLinear
+
+
+def procrustes_loop(source: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Kabsch pair by pair, differentiated through the SVD itself."""
+    rotations, translations = [], []
+    for x, y, w in zip(source, target, weight, strict=True):
+        w = w / w.sum()
+        cx, cy = (w[:, None] * x).sum(0), (w[:, None] * y).sum(0)
+        u, _, vh = torch.linalg.svd((w[:, None] * (x - cx)).T @ (y - cy))
+        reflect = torch.diag(torch.stack([w.new_tensor(1.0)] * 2 + [torch.det(vh.T @ u.T).sign()]))
+        rotation = vh.T @ reflect @ u.T
+        rotations.append(rotation)
+        translations.append(cy - rotation @ cx)
+    return torch.stack(rotations), torch.stack(translations)
+
+
+def cross_entropy_by_one_hot(f_x: Tensor, f_y: Tensor, scale: float, index: Tensor) -> Tensor:
+    """The paper's L_CE as written: a one-hot matrix against a softmax matrix."""
+    c = torch.softmax(scale * f_x @ f_y.mT, -1)
+    one_hot = F.one_hot(index, f_y.shape[1]).to(c.dtype)
+    return -torch.log((c * one_hot).sum(-1))
+
+
+class PlainNormLinear(FoldedNormLinear):
+    """Linear, batch norm, ReLU, maximum: four passes over the edges."""
+
+    def forward(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        out = F.relu(self.norm(self.linear(rows).flatten(0, 1))).view(*rows.shape[:2], -1)
+        return out, out.max(0).values
+
+
+def attention(x: Tensor, memory: Tensor, layer) -> Tensor:
+    """Attention head by head."""
+    heads = []
+    q, k, v = layer.query(x), layer.key(memory), layer.value(memory)
+    size = x.shape[-1] // layer.heads
+    for part in (slice(i * size, (i + 1) * size) for i in range(layer.heads)):
+        c = torch.softmax(q[..., part] @ k[..., part].mT / math.sqrt(size), -1)
+        heads.append(c @ v[..., part])
+    return layer.out(torch.cat(heads, -1))
+
+
+def std_norm(x: Tensor, gain: Tensor, bias: Tensor) -> Tensor:
+    """The annotated transformer's LayerNorm, as written."""
+    return gain * (x - x.mean(-1, keepdim=True)) / (x.std(-1, keepdim=True) + 1e-6) + bias
+
+
+def chamfer_loops(
+    aligned: Tensor, clean_target: Tensor, target: Tensor, clean_source: Tensor
+) -> float:
+    """RPMNet's modified Chamfer distance of one pair, point by point."""
+    there = [min(float(((x - y) ** 2).sum()) for y in clean_target) for x in aligned]
+    back = [min(float(((y - x) ** 2).sum()) for x in clean_source) for y in target]
+    return sum(there) / len(there) + sum(back) / len(back)
