@@ -134,7 +134,8 @@ def test_keys_that_differ_in_one_place_draw_differently():
     "change",
     [
         {"keep": 0.0}, {"keep": 1.2}, {"num_points": 2}, {"rotation_deg": 200.0}, {"jitter": -1.0},
-        {"min_rotation_deg": 181.0}, {"translation": -0.1}, {"outliers": 1.0}, {"outlier_distance": 0.0},
+        {"min_rotation_deg": 181.0}, {"translation": -0.1}, {"outliers": 1.0},
+        {"outlier_distance": 0.0},
     ],
 )  # fmt: skip
 def test_settings_out_of_range_are_named(change):

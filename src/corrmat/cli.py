@@ -7,15 +7,22 @@ from pathlib import Path
 from corrmat.errors import CorrmatError
 
 EPILOG = """examples:
-  corrmat run --config configs/exp/1.1.yaml                     both arms at laptop scale, our numbers beside the paper's
-  corrmat run --config configs/exp/1.2.yaml --scale smoke       the same in seconds, to see that everything works
-  corrmat fit --config configs/exp/1.1.yaml --arm DCP_corr --trainer.max_steps 200 --data.num_points 256
-  corrmat evaluate --config configs/exp/1.1.yaml --arm DCP_corr --checkpoint runs/laptop/shapes/1.1/DCP_corr/best.ckpt
-  corrmat data --sheet shapes.png                               make the embedded data set, draw its families
+  corrmat run --config configs/exp/1.1.yaml
+      both arms at laptop scale, our numbers beside the paper's
+  corrmat run --config configs/exp/1.2.yaml --scale smoke
+      the same in seconds, to see that everything works
+  corrmat fit --config configs/exp/1.1.yaml --arm DCP_corr --trainer.max_steps 200
+      one arm, with any setting changed
+  corrmat evaluate --config configs/exp/1.1.yaml --arm DCP_corr
+      the best checkpoint of the last run (or --checkpoint FILE) on the frozen test pairs
+  corrmat data --sheet shapes.png
+      make the embedded data set, draw its families
 
-Whatever a recipe sets can be set here: --data.*, --network.*, --optimizer.*, --trainer.* (Lightning's own
-Trainer) and --seed. `corrmat fit --help` lists them all with their types.
-exit codes: 0 done, 1 interrupted (the same command goes on), 2 something given cannot be used."""
+Whatever a recipe sets can be set here: --data.*, --network.*, --optimizer.*, --trainer.*
+(Lightning's own Trainer) and --seed; corrmat fit --help lists them all with their types.
+
+exit codes: 0 done; 1 interrupted (the same command goes on from its checkpoint);
+2 something given cannot be used, and one line says what."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -32,7 +39,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def reproduce(experiment: str) -> None:
-    """What a script of reproduce/ does: run the experiment of this id, with the caller's options."""
+    """Run the experiment of this id with the caller's options: all that reproduce/*.py do."""
     config = Path(sys.argv[0]).resolve().parents[1] / "configs" / "exp" / f"{experiment}.yaml"
     sys.exit(main(["run", "--config", str(config), *sys.argv[1:]]))
 
@@ -48,7 +55,7 @@ def _command(words: list[str]) -> int:
     for name, purpose in (
         (
             "run",
-            "train and test both arms of an experiment, write a record, print it beside the paper's",
+            "train and test both arms, write a record, print it beside the paper's",
         ),
         ("fit", "train one arm"),
         ("evaluate", "test the checkpoint of one arm"),
@@ -121,7 +128,7 @@ def _experiment(known: argparse.Namespace, options: list[str]) -> int:
         print(f"best checkpoint: {trained.checkpoint}")
         return 0
     checkpoint = known.checkpoint or folder / "best.ckpt"
-    for scored in experiment.test(known.arm, settings, checkpoint, found.bands_deg):
+    for scored in experiment.evaluate(known.arm, settings, checkpoint, found.bands_deg):
         for name, value in metrics.summary(scored).items():
             print(f"{name:28s} {value:.6g}")
     return 0
@@ -133,7 +140,8 @@ def _data(sheet: Path | None) -> int:
     for split in shapes.SIZE:
         clouds = shapes.load(split)
         print(
-            f"{split}: {len(clouds)} shapes of {len(clouds.names)} families in {shapes.cache_folder()}"
+            f"{split}: {len(clouds)} shapes of {len(clouds.names)} families, "
+            f"kept in {shapes.cache_folder()}"
         )
     if sheet is not None:
         from corrmat.data.sheet import draw

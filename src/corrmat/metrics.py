@@ -8,6 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torchmetrics import Metric
+from torchmetrics.utilities import dim_zero_cat
 
 from corrmat.ops import rigid
 from corrmat.types import PairBatch, Prediction
@@ -111,6 +112,12 @@ class RegistrationMetrics(Metric):
     """
 
     full_state_update = False
+    shape: list[Tensor]
+    predicted: list[Tensor]
+    truth: list[Tensor]
+    right: list[Tensor]
+    rows: list[Tensor]
+    distance: list[Tensor]
 
     def __init__(self) -> None:
         super().__init__()
@@ -130,11 +137,8 @@ class RegistrationMetrics(Metric):
         self.distance.append(chamfer(prediction, batch).double() if with_chamfer else none)
 
     def per_pair(self) -> dict[str, Tensor]:
-        """Every quantity of every pair, on the CPU: (B,), or (B, 3) for Euler angles, or (B, 12)."""
-        cat = {
-            name: torch.cat([t.cpu() for t in (value if isinstance(value, list) else [value])])
-            for name, value in ((n, getattr(self, n)) for n in self._defaults)
-        }
+        """Every quantity of every pair, on the CPU: (B,), Euler angles (B, 3), motion (B, 12)."""
+        cat = {name: dim_zero_cat(getattr(self, name)).cpu() for name in self._defaults}
         (r, t), (true_r, true_t) = _motion(cat["predicted"]), _motion(cat["truth"])
         return {
             "shape": cat["shape"],

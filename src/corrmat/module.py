@@ -62,8 +62,9 @@ class RegistrationModule(L.LightningModule):
         loss = self.loss(prediction, batch)
         if not torch.isfinite(loss):
             raise CorrmatError(
-                f"the loss is {loss.item()} at step {self.global_step} (epoch {self.current_epoch}, "
-                f"batch {batch_index}); lower --optimizer.lr or clip gradients"
+                f"the loss is {loss.item()} at step {self.global_step} "
+                f"(epoch {self.current_epoch}, batch {batch_index}); "
+                "lower --optimizer.lr or clip gradients"
             )
         self.log("train/loss", loss, prog_bar=True, batch_size=len(batch))
         if prediction.correspondence is not None:

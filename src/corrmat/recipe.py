@@ -32,7 +32,14 @@ _TOP = {
     "seed",
     *GROUPS,
 }
-_NOT_TRAINER = {"logger", "callbacks", "default_root_dir", "plugins", "profiler", "model_registry"}
+_NOT_TRAINER: set[str | int] = {
+    "logger",
+    "callbacks",
+    "default_root_dir",
+    "plugins",
+    "profiler",
+    "model_registry",
+}
 
 
 @dataclass(frozen=True)
@@ -74,6 +81,9 @@ def load(path: Path, scale: str, options: list[str], arms: list[str] | None = No
     unknown = sorted(set(merged) - _TOP)
     if unknown:
         raise CorrmatError(f"{path}: unknown key {unknown[0]!r}; known: {', '.join(sorted(_TOP))}")
+    for key in ("id", "title", "arms"):
+        if key not in merged:
+            raise CorrmatError(f"{path} lacks {key!r}")
     chosen = merged["arms"] if arms is None else {a: merged["arms"].get(a) for a in arms}
     settings = {}
     for arm, own in chosen.items():

@@ -78,12 +78,13 @@ def terminal_table(record: Mapping[str, Any]) -> str:
         f"{arm}: {found['pairs_seen']:,} pairs in {found['train_seconds'] / 60:.1f} min"
         for arm, found in record["arms"].items()
     )
-    title = f"\n{record['id']}  {record['title']}  ({record['scale']}, {record['data']}, {int(_pairs(record))} test pairs)"
+    where = f"({record['scale']}, {record['data']}, {int(_pairs(record))} test pairs)"
+    title = f"\n{record['id']}  {record['title']}  {where}"
     return "\n".join([title, effort, "", line(heads), "-" * len(line(heads)), *map(line, rows), ""])
 
 
 def markdown_summary(records: Sequence[Mapping[str, Any]]) -> str:
-    """The README's table: every record a row, METHOD and METHOD_corr side by side, then the paper."""
+    """The README's table: for every record a row an arm, then the paper's."""
     heads = ["experiment", "data", "arm", *(METRICS[name][0] for name in README_METRICS), "minutes"]
     lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
     for record in records:

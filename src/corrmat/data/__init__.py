@@ -1,0 +1,1 @@
+"""Sources of shapes, and the pairs that are made of them."""

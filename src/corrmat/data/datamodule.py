@@ -40,10 +40,13 @@ class PairDataset(Dataset[PairBatch]):
 
 
 class EpochSampler(Sampler[tuple[int, int]]):
-    """Names the items of one epoch: every shape once, in a random order if `shuffle`."""
+    """Names the items of one epoch: every shape once, in a random order if `shuffle`.
 
-    def __init__(self, size: int, seed: int, shuffle: bool) -> None:
-        self.size, self.seed, self.shuffle, self.epoch = size, seed, shuffle, 0
+    A run that goes on in the middle of an epoch leaves out the first `done` items, once.
+    """
+
+    def __init__(self, size: int, seed: int, shuffle: bool, done: int = 0) -> None:
+        self.size, self.seed, self.shuffle, self.done, self.epoch = size, seed, shuffle, done, 0
 
     def set_epoch(self, epoch: int) -> None:
         """Lightning calls this before every epoch; frozen pairs stay in epoch 0."""
@@ -54,14 +57,15 @@ class EpochSampler(Sampler[tuple[int, int]]):
         if self.shuffle:
             # The stream of an index no shape has.
             order = generator(Key(self.seed, STREAM["train"], self.epoch, 2**40)).permutation(order)
-        return ((self.epoch, int(shape)) for shape in order)
+        left, self.done = order[self.done :], 0
+        return ((self.epoch, int(shape)) for shape in left)
 
     def __len__(self) -> int:
         return self.size
 
 
 class RegistrationDataModule(L.LightningDataModule):
-    """Pairs made on the fly. Test and validation pairs are frozen, training pairs differ each epoch.
+    """Pairs made on the fly: frozen for test and validation, new ones each epoch for training.
 
     Args:
         data: "shapes", the embedded data set, or "modelnet40", the official HDF5 files.
@@ -112,6 +116,7 @@ class RegistrationDataModule(L.LightningDataModule):
         self.data, self.root, self.categories = data, root, categories
         self.counts = {"train": train_shapes, "test": test_shapes}
         self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed
+        self.batches_done = 0  # of the epoch in whose middle a run goes on
         self._clouds: dict[str, CloudSet] = {}
 
     def setup(self, stage: str | None = None) -> None:
@@ -152,9 +157,14 @@ class RegistrationDataModule(L.LightningDataModule):
         return DataLoader(
             dataset,
             batch_size=self.batch_size,
-            sampler=EpochSampler(len(dataset), self.seed, shuffle=training),
+            sampler=EpochSampler(
+                len(dataset),
+                self.seed,
+                shuffle=training,
+                done=self.batches_done * self.batch_size if training else 0,
+            ),
             num_workers=self.num_workers,
-            collate_fn=_as_is,
+            collate_fn=_as_is,  # pyright: ignore[reportArgumentType] (__getitems__ makes the batch)
             drop_last=training and len(dataset) >= self.batch_size,
             persistent_workers=self.num_workers > 0,
         )

@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from corrmat.data.clouds import CloudSet
@@ -214,7 +214,7 @@ def _nearest(source: np.ndarray, target: np.ndarray, how: PairSettings) -> np.nd
     """The nearest target point of each source point; M where outliers may be and none is near."""
     reach = how.outlier_distance if how.outliers else np.inf
     pairs = zip(source, target, strict=True)
-    found = [cKDTree(y).query(x, distance_upper_bound=reach)[1] for x, y in pairs]
+    found = [KDTree(y).query(x, distance_upper_bound=reach)[1] for x, y in pairs]
     return np.stack(found).astype(np.int64)
 
 

@@ -6,7 +6,7 @@ first n shapes are a balanced data set of their own.
 
 import hashlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -91,6 +91,7 @@ def make_shape(split: str, index: int) -> tuple[np.ndarray, int]:
     rng = np.random.Generator(np.random.Philox(key=key))
     label = index % len(NAMES)
     mesh = trimesh.util.concatenate(families.FAMILIES[NAMES[label]](rng))
+    assert isinstance(mesh, trimesh.Trimesh)
     points, faces = trimesh.sample.sample_surface(mesh, POINTS, seed=rng)[:2]
     points = points - points.mean(0)
     points = points / np.linalg.norm(points, axis=1).max()
@@ -105,7 +106,7 @@ def _task(task: tuple[str, int]) -> tuple[np.ndarray, int]:
     return make_shape(*task)
 
 
-def _collect(made: Iterator[tuple[np.ndarray, int]]) -> CloudSet:
+def _collect(made: Iterable[tuple[np.ndarray, int]]) -> CloudSet:
     rows, labels = zip(*made, strict=True)
     return CloudSet(np.stack(rows), np.array(labels, np.int64), NAMES)
 
@@ -113,7 +114,7 @@ def _collect(made: Iterator[tuple[np.ndarray, int]]) -> CloudSet:
 def _digest(clouds: CloudSet) -> str:
     digest = hashlib.sha256()
     for array in (clouds.rows, clouds.labels):
-        digest.update(np.ascontiguousarray(array))
+        digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()
 
 

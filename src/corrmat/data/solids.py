@@ -7,7 +7,7 @@ import trimesh
 from shapely.geometry import Polygon
 from trimesh import Trimesh, creation
 
-Vector = Sequence[float]
+Vector = Sequence[float] | np.ndarray
 SECTIONS = 16  # facets of everything round
 
 
@@ -21,7 +21,7 @@ def box(size: Vector, at: Vector = (0, 0, 0), tilt: tuple[str, float] | None = N
 
 def rod(start: Vector, end: Vector, radius: float) -> Trimesh:
     """A round bar from `start` to `end`."""
-    return creation.cylinder(radius=radius, segment=[start, end], sections=SECTIONS)
+    return creation.cylinder(radius=radius, segment=np.array([start, end]), sections=SECTIONS)
 
 
 def disc(radius: float, height: float, at: Vector = (0, 0, 0), axis: str = "z") -> Trimesh:
@@ -72,4 +72,4 @@ def legs(
 
 def _turn(axis: str, degrees: float) -> np.ndarray:
     direction = np.eye(3)["xyz".index(axis)]
-    return trimesh.transformations.rotation_matrix(np.deg2rad(degrees), direction)
+    return np.asarray(trimesh.transformations.rotation_matrix(np.deg2rad(degrees), direction))

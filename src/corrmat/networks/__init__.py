@@ -1,0 +1,1 @@
+"""One paper's network a file, and the blocks that they share."""

@@ -82,6 +82,15 @@ def moments(rows: Tensor) -> Moments:
     return Moments(mean, second - torch.outer(mean, mean))
 
 
+class _TrackingNorm(nn.BatchNorm1d):
+    """Batch norm's parameters and statistics, known to be there."""
+
+    running_mean: Tensor
+    running_var: Tensor
+    num_batches_tracked: Tensor
+    momentum: float
+
+
 class FoldedNormLinear(nn.Module):
     """Linear without bias, batch norm, ReLU, and the maximum over the slabs.
 
@@ -92,7 +101,7 @@ class FoldedNormLinear(nn.Module):
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
         self.linear = nn.Linear(inputs, outputs, bias=False)
-        self.norm = nn.BatchNorm1d(outputs)
+        self.norm = _TrackingNorm(outputs)
 
     def forward(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Rows (k, P, inputs) -> activations (k, P, outputs) and their maximum (P, outputs)."""

@@ -52,7 +52,7 @@ def axis_angle_to_matrix(axis: Tensor, angle_rad: Tensor) -> Tensor:
 def procrustes(
     source: Tensor, target: Tensor, weight: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Weighted orthogonal Procrustes (Horn / Kabsch): the motion that best takes source onto target.
+    """Weighted orthogonal Procrustes (Horn, Kabsch): the motion that best maps source to target.
 
     Minimises `sum_i w_i ||R x_i + t - y_i||^2` over proper rotations, in float64 inside.
     Where the points do not determine the rotation (all equal, or on a line) one of the

@@ -1,0 +1,7 @@
+"""`python -m corrmat` is the console script `corrmat`."""
+
+import sys
+
+from corrmat.cli import main
+
+sys.exit(main())

@@ -1,0 +1,117 @@
+"""What happens beside the training step: the curve that figures show, and Ctrl-C."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+from lightning.pytorch.callbacks import Callback, TQDMProgressBar
+from torch import Tensor
+
+from corrmat.types import PairBatch
+
+SHOWN = (
+    "match_accuracy",
+    "rotation_error_deg_mean",
+    "rotation_error_deg_median",
+    "relative_euler_rmse_deg",
+    "translation_rmse",
+)
+
+
+class Curve(Callback):
+    """Collects what the paper's figures show: validation metrics against pairs seen."""
+
+    def __init__(self) -> None:
+        self.pairs, self.seconds = 0, 0.0
+        self.points: list[dict[str, float]] = []
+        self._losses: list[Tensor] = []
+        self._since: float | None = None
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Start the clock."""
+        self._since = time.monotonic()
+
+    def on_train_batch_end(
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: Any,  # noqa: ANN401 (Lightning's signature)
+        batch: PairBatch,
+        batch_idx: int,
+    ) -> None:
+        """Count."""
+        self.pairs += len(batch)
+        self._losses.append(outputs["loss"].detach())
+
+    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Add a point, and say it."""
+        if trainer.sanity_checking or not self._losses:
+            return
+        self._tick()
+        values = {
+            k.removeprefix("val/"): float(v)
+            for k, v in trainer.callback_metrics.items()
+            if k.startswith("val/")
+        }
+        loss = float(torch.stack([x.cpu() for x in self._losses]).mean())
+        self._losses.clear()
+        self.points.append({"pairs_seen": self.pairs, "loss": loss} | {k: values[k] for k in SHOWN})
+        line = (
+            f"step {trainer.global_step:6d}  {self.pairs:7,d} pairs  {self.seconds:5.0f} s  "
+            f"loss {loss:7.4f}  matches {100 * values['match_accuracy']:5.1f} %  "
+            f"rotation {values['rotation_error_deg_mean']:7.2f} deg mean, "
+            f"{values['rotation_error_deg_median']:6.2f} median"
+        )
+        bar = trainer.progress_bar_callback
+        bar.print(line) if isinstance(bar, TQDMProgressBar) else say(line)
+
+    def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Stop the clock."""
+        self._tick()
+        self._since = None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Goes into checkpoints, so that a resumed run has its whole curve."""
+        self._tick()
+        losses = [float(loss) for loss in self._losses]
+        return {
+            "pairs": self.pairs, "seconds": self.seconds, "points": self.points, "losses": losses,
+        }  # fmt: skip
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on from a checkpoint."""
+        self.pairs, self.seconds = state_dict["pairs"], state_dict["seconds"]
+        self.points = state_dict["points"]
+        self._losses = [torch.tensor(loss) for loss in state_dict["losses"]]
+
+    def _tick(self) -> None:
+        if self._since is not None:
+            now = time.monotonic()
+            self.seconds += now - self._since
+            self._since = now
+
+
+class SaveOnInterrupt(Callback):
+    """Ctrl-C leaves a checkpoint and says how to go on."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def on_exception(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException
+    ) -> None:
+        """Lightning calls this before it gives up."""
+        if isinstance(exception, KeyboardInterrupt):
+            # The batch under way does not count, or all later validations come one too early.
+            total = trainer.fit_loop.epoch_loop.batch_progress.total
+            total.ready = total.completed
+            trainer.save_checkpoint(self.path)
+            say(f"interrupted at step {trainer.global_step}; saved {self.path}")
+            say("the same command goes on from there")
+
+
+def say(text: str) -> None:
+    """Print a line for the user."""
+    print(text, flush=True)

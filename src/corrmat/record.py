@@ -1,0 +1,101 @@
+"""The record of an experiment: metrics.json, per_pair.csv, config.yaml and curves.png."""
+
+import csv
+import json
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from torch import Tensor
+
+from corrmat import metrics, report
+from corrmat.recipe import Recipe
+
+FILES = ("per_pair.csv", "config.yaml", "curves.png", "metrics.json")
+
+
+def scores(tests: list[dict[str, Tensor]], bands_deg: tuple[float, ...]) -> dict[str, Any]:
+    """Metrics over all pairs of an arm, and for each rotation band if there are bands.
+
+    Args:
+        tests: per-pair values (`RegistrationMetrics.per_pair`), one set a band.
+        bands_deg: the bands' edges; empty if `tests` holds one set of all pairs.
+    """
+    everything = {key: torch.cat([found[key] for found in tests]) for key in tests[0]}
+    found_all: dict[str, Any] = metrics.summary(everything)
+    if bands_deg:
+        found_all["bands"] = [
+            {"band_deg": [low, high]} | metrics.summary(found)
+            for low, high, found in zip(bands_deg, bands_deg[1:], tests, strict=False)
+        ]
+    return found_all
+
+
+def rows(arm: str, band: int, found: dict[str, Tensor]) -> list[dict[str, Any]]:
+    """Lines of per_pair.csv: the predicted transform of each pair and what it scores."""
+    columns = found["transform"].tolist()
+    return [
+        {
+            "arm": arm,
+            "band": band,
+            "shape": int(found["shape"][i]),
+            "category": int(found["category"][i]),
+            "rotation_error_deg": f"{float(found['rotation_error_deg'][i]):.5g}",
+            "translation_error": f"{float(found['translation_error'][i]):.5g}",
+            "right": int(found["right"][i]) if found["right"][i].isfinite() else "",
+            "rows": int(found["rows"][i]),
+            "chamfer": f"{float(found['chamfer'][i]):.5g}",
+            "transform": " ".join(f"{value:.6g}" for value in columns[i]),
+        }
+        for i in range(len(columns))
+    ]
+
+
+def write(
+    folder: Path, record: dict[str, Any], recipe: Recipe, lines: list[dict[str, Any]]
+) -> None:
+    """Write all files beside their place, then move them in, metrics.json last."""
+    partial = folder.with_name(f".{folder.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    with (partial / "per_pair.csv").open("w", newline="") as file:
+        table = csv.DictWriter(file, list(lines[0]))
+        table.writeheader()
+        table.writerows(lines)
+    settings = {arm: report.plain(own.as_dict()) for arm, own in recipe.settings.items()}
+    for own in settings.values():
+        own["data"].pop("root")  # where the data lies is nobody else's business
+    config = {"id": recipe.id, "scale": recipe.scale, "arms": settings}
+    (partial / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
+    report.curves_figure(record, partial / "curves.png")
+    (partial / "metrics.json").write_text(json.dumps(record, indent=1) + "\n")
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in FILES:
+        (partial / name).replace(folder / name)
+    partial.rmdir()
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write a file so that nobody ever reads half of it."""
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(text)
+    partial.replace(path)
+
+
+def commit() -> str | None:
+    """The commit of the code, "+" behind it when files have changed; None outside a checkout."""
+    here = Path(__file__).parent
+
+    def git(*words: str) -> str:
+        return subprocess.run(
+            ["git", *words], cwd=here, capture_output=True, text=True, check=True
+        ).stdout
+
+    try:
+        changed = git("status", "--porcelain", "--", ".")
+        return git("rev-parse", "--short=12", "HEAD").strip() + ("+" if changed.strip() else "")
+    except (OSError, subprocess.CalledProcessError):
+        return None

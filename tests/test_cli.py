@@ -1,0 +1,89 @@
+import subprocess
+import sys
+
+import pytest
+from conftest import ROOT
+
+from corrmat.cli import main
+
+FIT = ["fit", "--config", str(ROOT / "configs" / "exp" / "1.1.yaml"), "--scale", "smoke"]
+
+
+def run(*words):
+    return subprocess.run([sys.executable, "-m", "corrmat", *words], capture_output=True, text=True)
+
+
+def test_help_teaches_by_example():
+    found = run("--help")
+    assert found.returncode == 0
+    for word in ("corrmat run --config configs/exp/1.1.yaml", "exit codes", "evaluate", "--data.*"):
+        assert word in found.stdout
+
+
+def test_help_of_a_command_lists_typed_settings(capsys):
+    assert main(["fit", "--help"]) == 0
+    shown = capsys.readouterr().out
+    for word in (
+        "--arm",
+        "--data.num_points",
+        "--network.width",
+        "--trainer.max_steps",
+        "--optimizer.lr",
+    ):
+        assert word in shown
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--data.nump", "3"], "unrecognized arguments: --data.nump 3"),
+        (["--data.num_points", "many"], "data.num_points"),
+        (["--data.sampling", "some"], "identical"),
+        (["--data.keep", "7"], "keep = 7.0 is out of range"),
+        (["--trainer.max_stepz", "3"], "unrecognized arguments: --trainer.max_stepz"),
+        (["--network.width", "33"], "width 33 is not a multiple of 4 heads"),
+        (["--network.k", "60"], "too small for DCP_corr, which needs 60"),
+        (["--data.num_points", "5000"], "have 2048 points"),
+        (["--data.categories", "[sofa, rocket]"], "unknown category 'rocket'"),
+        (["--data.data", "modelnet40"], "ROOT="),
+        (["--data.data", "modelnet40", "--data.root", "nowhere"], "no ModelNet40 in nowhere"),
+        (["--arm", "ICP"], "unknown arm 'ICP'"),
+        (["--config", "nowhere.yaml"], "no recipe nowhere.yaml"),
+    ],
+)
+def test_bad_input_is_one_line_and_writes_nothing(options, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("CORRMAT_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr("corrmat.data.shapes.SIZE", {"train": 60, "test": 10})
+    assert main([*FIT, "--runs", str(tmp_path / "runs"), *options]) == 2
+    shown = capsys.readouterr()
+    assert message in shown.err
+    assert len(shown.err.strip().splitlines()) == 1
+    assert shown.err.startswith("corrmat: error: ")
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    "words", [["fit"], ["nonsense"], ["run", "--scale", "huge"], ["data", "--bogus"], []]
+)
+def test_bad_commands_exit_with_2(words, capsys):
+    try:
+        code = main(words)
+    except SystemExit as stopped:  # argparse's own way to refuse
+        code = stopped.code
+    assert code == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_a_checkpoint_of_another_network_is_refused(tmp_path, capsys):
+    runs = ["--runs", str(tmp_path / "runs")]
+    assert main([*FIT, *runs, "--trainer.max_steps", "1"]) == 0
+    evaluate = ["evaluate", *FIT[1:], *runs]
+    assert main(evaluate) == 0
+    assert "rotation_error_deg_mean" in capsys.readouterr().out
+    assert main([*evaluate, "--network.width", "64"]) == 2
+    assert "does not fit these settings" in capsys.readouterr().err
+    broken = tmp_path / "broken.ckpt"
+    broken.write_bytes(b"PK not a checkpoint")
+    assert main([*evaluate, "--checkpoint", str(broken)]) == 2
+    assert main([*evaluate, "--checkpoint", str(tmp_path / "none.ckpt")]) == 2
+    assert "train first" in capsys.readouterr().err

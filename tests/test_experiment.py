@@ -1,0 +1,180 @@
+"""Smoke training of every experiment, and what a run promises besides its numbers."""
+
+import csv
+import json
+import math
+import socket
+
+import pytest
+import torch
+from conftest import ROOT, shared
+
+from corrmat import experiment, recipe
+from corrmat.errors import CorrmatError
+from corrmat.module import RegistrationModule
+
+IDS = [path.stem for path in sorted((ROOT / "configs" / "exp").glob("*.yaml"))]
+
+
+def load(identity, *options, arms=None):
+    path = ROOT / "configs" / "exp" / f"{identity}.yaml"
+    return recipe.load(path, "smoke", ["--trainer.enable_progress_bar", "false", *options], arms)
+
+
+def numbers(record):
+    """Everything but what a clock says."""
+    if isinstance(record, dict):
+        return {k: numbers(v) for k, v in record.items() if k != "train_seconds"}
+    return [numbers(v) for v in record] if isinstance(record, list) else repr(record)
+
+
+@pytest.mark.parametrize("identity", IDS)
+def test_smoke_run_leaves_a_whole_record(identity, tmp_path, capsys):
+    found = load(identity)
+    experiment.run(found, tmp_path / "results", tmp_path / "runs")
+    folder = tmp_path / "results" / "smoke" / "shapes" / identity
+    assert {p.name for p in folder.iterdir()} == {
+        "metrics.json",
+        "config.yaml",
+        "per_pair.csv",
+        "curves.png",
+    }
+    record = json.loads((folder / "metrics.json").read_text())
+    assert list(record["arms"]) == list(found.settings)
+    bands = max(1, len(found.bands_deg) - 1)
+    for arm in record["arms"].values():
+        assert arm["pairs"] == 8 * bands
+        assert arm["pairs_seen"] == 32
+        assert [point["pairs_seen"] for point in arm["curve"]] == [16, 32]
+        assert len(arm.get("bands", [])) == (bands if bands > 1 else 0)
+        assert 0 < arm["rotation_error_deg_mean"] < 180
+    rows = list(csv.DictReader((folder / "per_pair.csv").open()))
+    assert len(rows) == 2 * 8 * bands
+    assert (folder / "curves.png").read_bytes().startswith(b"\x89PNG")
+    assert "correct matches, %" in capsys.readouterr().out
+    assert not list((tmp_path / "results").rglob("*.partial"))
+
+
+def test_the_same_command_gives_the_same_numbers_bit_for_bit(tmp_path):
+    records = [experiment.run(load("1.2"), tmp_path / f"{i}", tmp_path / "runs") for i in range(2)]
+    assert numbers(records[0]) == numbers(records[1])
+    other = experiment.run(load("1.2", "--seed", "1"), tmp_path / "2", tmp_path / "runs")
+    assert numbers(other) != numbers(records[0])
+
+
+def test_per_pair_transforms_score_to_the_metrics_of_the_record(tmp_path):
+    """Predict once, score many: the CSV alone gives the record's numbers again."""
+    found = load("1.1")
+    record = experiment.run(found, tmp_path / "results", tmp_path / "runs")
+    rows = list(csv.DictReader((tmp_path / "results/smoke/shapes/1.1/per_pair.csv").open()))
+    for arm, scores in record["arms"].items():
+        own = [row for row in rows if row["arm"] == arm]
+        mean = sum(float(row["rotation_error_deg"]) for row in own) / len(own)
+        assert mean == pytest.approx(scores["rotation_error_deg_mean"], rel=1e-4)
+        right, total = (sum(int(row[k]) for row in own) for k in ("right", "rows"))
+        assert right / total == pytest.approx(scores["match_accuracy"])
+        assert all(len(row["transform"].split()) == 12 for row in own)
+
+
+def test_experiment_1_4_takes_the_networks_of_1_1(tmp_path, capsys):
+    first = experiment.run(load("1.1"), tmp_path / "results", tmp_path / "runs")
+    capsys.readouterr()
+    again = experiment.run(load("1.4"), tmp_path / "results", tmp_path / "runs")
+    assert capsys.readouterr().out.count("the one that experiment 1.1 trained") == 2
+    for arm in first["arms"]:
+        assert again["arms"][arm]["curve"] == first["arms"][arm]["curve"]
+    alone = experiment.run(load("1.4"), tmp_path / "other", tmp_path / "other_runs")
+    assert numbers(alone) == numbers(again)
+    capsys.readouterr()
+    experiment.run(load("1.4", "--optimizer.lr", "1e-4"), tmp_path / "results", tmp_path / "runs")
+    assert "trained" not in capsys.readouterr().out  # other settings: not the same network
+
+
+def test_the_real_part_runs_by_the_same_command(tmp_path):
+    found = load("1.2", "--data.data", "modelnet40", "--data.root", str(shared("data")))
+    record = experiment.run(found, tmp_path / "results", tmp_path / "runs")
+    assert record["data"] == "modelnet40"
+    config = (tmp_path / "results/smoke/modelnet40/1.2/config.yaml").read_text()
+    assert str(shared("data")) not in config
+
+
+def stop_at(step, error, monkeypatch):
+    original = RegistrationModule.training_step
+
+    def training_step(self, batch, batch_index):
+        if self.global_step == step:
+            raise error
+        return original(self, batch, batch_index)
+
+    monkeypatch.setattr(RegistrationModule, "training_step", training_step)
+
+
+def test_ctrl_c_leaves_a_checkpoint_and_the_same_command_goes_on(tmp_path, monkeypatch, capsys):
+    found = load("1.1", arms=["DCP_corr"])
+    settings, folder = found.settings["DCP_corr"], tmp_path / "DCP_corr"
+    whole = experiment.train("DCP_corr", settings, tmp_path / "whole")
+    with monkeypatch.context() as patch:
+        stop_at(6, KeyboardInterrupt(), patch)
+        with pytest.raises(SystemExit) as stopped:
+            experiment.train("DCP_corr", settings, folder)
+    assert stopped.value.code == 1
+    assert "interrupted at step 6" in capsys.readouterr().out
+    assert (folder / "last.ckpt").is_file()
+    assert not (folder / "trained.json").exists()
+    trained = experiment.train("DCP_corr", settings, folder)
+    assert "going on from" in capsys.readouterr().out
+    assert trained.pairs_seen == whole.pairs_seen == 32
+    assert trained.curve == whole.curve
+    weights = [torch.load(t.checkpoint, weights_only=True)["state_dict"] for t in (whole, trained)]
+    assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
+
+
+def test_other_settings_do_not_go_on_from_an_old_checkpoint(tmp_path, monkeypatch, capsys):
+    with monkeypatch.context() as patch:
+        stop_at(5, KeyboardInterrupt(), patch)
+        with pytest.raises(SystemExit):
+            experiment.train("DCP", load("1.1").settings["DCP"], tmp_path / "DCP")
+    capsys.readouterr()
+    settings = load("1.1", "--optimizer.lr", "1e-4").settings["DCP"]
+    experiment.train("DCP", settings, tmp_path / "DCP")
+    assert "going on" not in capsys.readouterr().out
+
+
+def test_a_loss_that_is_no_number_stops_the_run_and_leaves_no_record(tmp_path, monkeypatch):
+    original = RegistrationModule.training_step
+
+    def poisoned(self, batch, batch_index):
+        if self.global_step == 3:
+            batch.source = batch.source * torch.nan
+        return original(self, batch, batch_index)
+
+    monkeypatch.setattr(RegistrationModule, "training_step", poisoned)
+    with pytest.raises(CorrmatError, match=r"the loss is nan at step 3 \(epoch 0, batch 3\)"):
+        experiment.run(load("1.1"), tmp_path / "results", tmp_path / "runs")
+    assert not (tmp_path / "results").exists()
+
+
+def test_wandb_writes_offline_and_touches_no_network(tmp_path, monkeypatch):
+    monkeypatch.delenv("WANDB_MODE")
+
+    def blocked(self, address):
+        if self.family != socket.AF_UNIX and address[0] not in ("127.0.0.1", "localhost", "::1"):
+            raise AssertionError(f"network touched: {address}")
+        return original(self, address)
+
+    original = socket.socket.connect
+    monkeypatch.setattr(socket.socket, "connect", blocked)
+    experiment.train("DCP", load("1.1").settings["DCP"], tmp_path / "DCP")
+    logs = list((tmp_path / "DCP" / "wandb").glob("offline-run-*/*.wandb"))
+    assert len(logs) == 1
+    assert logs[0].stat().st_size > 0
+    steps = list(csv.DictReader((tmp_path / "DCP" / "csv" / "version_0" / "metrics.csv").open()))
+    assert any(row["val/match_accuracy"] for row in steps)
+
+
+def test_checkpoints_reload_to_the_same_network(tmp_path):
+    settings = load("1.1").settings["DCP_corr"]
+    trained = experiment.train("DCP_corr", settings, tmp_path / "run")
+    first, again = (experiment.evaluate("DCP_corr", settings, trained.checkpoint) for _ in range(2))
+    assert torch.equal(first[0]["transform"], again[0]["transform"])
+    assert math.isfinite(float(first[0]["rotation_error_deg"].mean()))

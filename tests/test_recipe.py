@@ -1,0 +1,82 @@
+import pytest
+import yaml
+from conftest import ROOT
+
+from corrmat import recipe
+from corrmat.errors import CorrmatError
+from corrmat.experiment import make_module
+from corrmat.methods import METHODS
+
+RECIPES = sorted((ROOT / "configs" / "exp").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("scale", recipe.SCALES)
+@pytest.mark.parametrize("path", RECIPES, ids=lambda p: p.stem)
+def test_every_recipe_builds_at_every_scale(path, scale):
+    found = recipe.load(path, scale, [])
+    assert found.id == path.stem
+    assert len(found.settings) == 2
+    assert set(found.paper) == set(found.settings)
+    for arm, settings in found.settings.items():
+        assert isinstance(make_module(arm, settings), METHODS[arm])
+    networks = [settings.network for settings in found.settings.values()]
+    assert networks[0] == networks[1]  # the arms differ in their loss alone
+
+
+@pytest.mark.parametrize("path", RECIPES, ids=lambda p: p.stem)
+def test_every_recipe_has_a_script_and_a_make_target(path):
+    script = ROOT / "reproduce" / f"exp{path.stem.replace('.', '_')}.py"
+    assert f'reproduce("{path.stem}")' in script.read_text()
+    assert f"exp{path.stem}" in (ROOT / "Makefile").read_text()
+
+
+def test_the_papers_settings_are_to_the_letter():
+    found = recipe.load(ROOT / "configs" / "exp" / "1.2.yaml", "paper", []).settings["DCP_corr"]
+    assert make_module("DCP_corr", found).network.embed.k == 20
+    assert (found.data.num_points, found.data.batch_size, found.data.keep) == (512, 16, 0.7)
+    assert (found.optimizer.lr, found.optimizer.weight_decay) == (1e-3, 1e-4)
+    assert found.optimizer.milestones == (25, 50, 100, 150, 200)
+    assert found.trainer.max_epochs == 250
+    size = sum(p.numel() for p in make_module("DCP_corr", found).parameters())
+    assert round(size / 1e6, 2) == 5.57
+
+
+def test_layers_lie_over_each_other(tmp_path):
+    (tmp_path / "base.yaml").write_text(
+        yaml.safe_dump(
+            {
+                "arms": {"DCP": {"optimizer": {"lr": 0.5}}, "DCP_corr": {}},
+                "data": {"num_points": 1000, "keep": 0.9},
+                "scales": {"smoke": {"data": {"num_points": 100}, "optimizer": {"lr": 0.1}}},
+            }
+        )
+    )
+    path = tmp_path / "x.yaml"
+    path.write_text("id: x\ntitle: t\nbase: base.yaml\ndata: {keep: 0.8}\n")
+    found = recipe.load(path, "smoke", ["--network.width", "64", "--data.jitter=0.5"])
+    dcp, corr = found.settings["DCP"], found.settings["DCP_corr"]
+    assert (dcp.data.num_points, dcp.data.keep, dcp.data.jitter) == (100, 0.8, 0.5)
+    assert (dcp.optimizer.lr, corr.optimizer.lr) == (0.5, 0.1)
+    assert dcp.network.width == corr.network.width == 64
+    assert recipe.load(path, "laptop", []).settings["DCP"].data.num_points == 1000
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("id: x\ntitle: t\narms: {DCP: {}}\ndata: {num_pionts: 3}\n", "num_pionts"),
+        ("id: x\ntitle: t\narms: {DCP: {}}\nlearning_rate: 3\n", "unknown key 'learning_rate'"),
+        ("id: x\ntitle: t\narms: {ICP: {}}\n", "unknown arm 'ICP'"),
+        ("id: [", "is not YAML"),
+        ("- 3\n", "holds no settings"),
+        ("title: t\narms: {DCP: {}}\n", "lacks 'id'"),
+        ("id: x\ntitle: t\n", "lacks 'arms'"),
+        ("id: x\ntitle: t\nbase: nowhere.yaml\n", "no recipe .*nowhere.yaml"),
+    ],
+)
+def test_a_bad_recipe_is_named_in_one_line(tmp_path, content, message):
+    path = tmp_path / "bad.yaml"
+    path.write_text(content)
+    with pytest.raises(CorrmatError, match=message) as caught:
+        recipe.load(path, "smoke", [])
+    assert "\n" not in str(caught.value)
