@@ -13,6 +13,19 @@ def run(*words):
     return subprocess.run([sys.executable, "-m", "corrmat", *words], capture_output=True, text=True)
 
 
+def test_a_script_of_reproduce_is_the_whole_experiment(tmp_path):
+    """What `make exp1.2` calls, from another folder."""
+    words = ["--scale", "smoke", "--results", "results", "--runs", "runs"]
+    script = ROOT / "reproduce" / "exp1_2.py"
+    found = subprocess.run(
+        [sys.executable, str(script), *words], capture_output=True, text=True, cwd=tmp_path
+    )
+    assert found.returncode == 0, found.stderr
+    assert "paper DCP_corr" in found.stdout
+    assert "Warning" not in found.stderr
+    assert (tmp_path / "results" / "smoke" / "shapes" / "1.2" / "metrics.json").is_file()
+
+
 def test_help_teaches_by_example():
     found = run("--help")
     assert found.returncode == 0

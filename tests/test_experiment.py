@@ -178,3 +178,20 @@ def test_checkpoints_reload_to_the_same_network(tmp_path):
     first, again = (experiment.evaluate("DCP_corr", settings, trained.checkpoint) for _ in range(2))
     assert torch.equal(first[0]["transform"], again[0]["transform"])
     assert math.isfinite(float(first[0]["rotation_error_deg"].mean()))
+
+
+def test_a_record_is_json_that_everybody_can_read(tmp_path, monkeypatch):
+    """A metric that is not a number is null: JSON knows no NaN."""
+    from corrmat import metrics
+
+    monkeypatch.setattr(
+        metrics, "chamfer", lambda prediction, batch: torch.full((len(batch),), torch.nan)
+    )
+    experiment.run(load("1.1"), tmp_path / "results", tmp_path / "runs")
+    text = (tmp_path / "results/smoke/shapes/1.1/metrics.json").read_text()
+
+    def refuse(word):
+        raise AssertionError(f"{word} is not JSON")
+
+    record = json.loads(text, parse_constant=refuse)
+    assert record["arms"]["DCP"]["chamfer"] is None

@@ -80,3 +80,21 @@ def test_a_bad_recipe_is_named_in_one_line(tmp_path, content, message):
     with pytest.raises(CorrmatError, match=message) as caught:
         recipe.load(path, "smoke", [])
     assert "\n" not in str(caught.value)
+
+
+def test_epochs_on_the_command_line_overrule_the_recipes_steps():
+    path = ROOT / "configs" / "exp" / "1.1.yaml"
+    assert recipe.load(path, "laptop", []).settings["DCP"].trainer.max_steps == 2400
+    trainer = recipe.load(path, "laptop", ["--trainer.max_epochs", "5"]).settings["DCP"].trainer
+    assert (trainer.max_epochs, trainer.max_steps) == (5, -1)
+
+
+def test_no_gpu_without_float64_is_chosen_by_itself(monkeypatch):
+    import torch
+
+    from corrmat.experiment import trainer_options
+
+    settings = recipe.load(ROOT / "configs" / "exp" / "1.1.yaml", "laptop", []).settings["DCP"]
+    assert trainer_options(settings)["accelerator"] == "auto"
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
+    assert trainer_options(settings)["accelerator"] == "cpu"

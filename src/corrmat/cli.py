@@ -68,16 +68,14 @@ def _command(words: list[str]) -> int:
     data.add_argument("--sheet", type=Path, metavar="PNG", help="draw one shape of every family")
     report = commands.add_parser("report", help="rewrite the tables of the documents from results/")
     report.add_argument("--results", type=Path, default=Path("results"), help="folder of records")
-    report.add_argument(
-        "--readme", type=Path, default=Path("README.md"), help="where the table goes"
-    )
+    report.add_argument("--docs", type=Path, default=Path(), help="folder of README.md and docs/")
     known, options = parser.parse_known_args(words)
     if known.command == "data":
         _refuse(options)
         return _data(known.sheet)
     if known.command == "report":
         _refuse(options)
-        return _report(known.results, known.readme)
+        return _report(known.results, known.docs)
     return _experiment(known, options)
 
 
@@ -127,9 +125,12 @@ def _experiment(known: argparse.Namespace, options: list[str]) -> int:
         )
         print(f"best checkpoint: {trained.checkpoint}")
         return 0
-    checkpoint = known.checkpoint or folder / "best.ckpt"
-    for scored in experiment.evaluate(known.arm, settings, checkpoint, found.bands_deg):
-        for name, value in metrics.summary(scored).items():
+    checkpoint = known.checkpoint or experiment.best_checkpoint(found, known.arm, known.runs)
+    tests = experiment.evaluate(known.arm, settings, checkpoint, found.bands_deg)
+    for number, pairs in enumerate(tests):
+        if found.bands_deg:
+            print(f"\n{found.bands_deg[number]:g} to {found.bands_deg[number + 1]:g} deg")
+        for name, value in metrics.summary(pairs).items():
             print(f"{name:28s} {value:.6g}")
     return 0
 
@@ -151,14 +152,16 @@ def _data(sheet: Path | None) -> int:
     return 0
 
 
-def _report(results: Path, readme: Path) -> int:
+def _report(results: Path, docs: Path) -> int:
     from corrmat import report
 
-    records = report.read_records(results)
+    records = report.read_records(results, scale="laptop")
     if not records:
-        raise CorrmatError(f"no records in {results}; run an experiment first")
-    report.refresh(readme, "results", report.markdown_summary(records))
-    print(f"{len(records)} records -> {readme}")
+        raise CorrmatError(f"no laptop records in {results}; run an experiment first")
+    pages = docs / "README.md", docs / "docs" / "reproduction.md"
+    report.refresh(pages[0], "results", report.markdown_summary(records))
+    report.refresh(pages[1], "tables", report.markdown_tables(records))
+    print(f"{len(records)} records -> {pages[0]}, {pages[1]}")
     return 0
 
 

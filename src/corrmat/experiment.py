@@ -147,7 +147,7 @@ def evaluate(
         {"min_rotation_deg": low, "rotation_deg": high, "translation": 0.0}
         for low, high in zip(bands_deg, bands_deg[1:], strict=False)
     ]
-    quiet = {"logger": False, "enable_checkpointing": False, "enable_model_summary": False}
+    quiet = {"logger": False, "enable_checkpointing": False}
     trainer = L.Trainer(**{**trainer_options(settings), "enable_progress_bar": False, **quiet})
     found = []
     for changes in how or [{}]:
@@ -182,6 +182,14 @@ def make_module(arm: str, settings: Settings) -> RegistrationModule:
             f"{network.min_points}; raise --data.num_points or lower --network.k"
         )
     return method(network, OptimizerSettings(**settings.optimizer.as_dict()))
+
+
+def best_checkpoint(recipe: Recipe, arm: str, runs: Path) -> Path:
+    """Where the best weights of an arm lie: its own, or those of `networks_of`."""
+    places = [Path(runs, recipe.scale, recipe.data, recipe.id, arm, "best.ckpt")]
+    if recipe.networks_of is not None:
+        places.append(Path(runs, recipe.scale, recipe.data, recipe.networks_of, arm, "best.ckpt"))
+    return next((path for path in places if path.is_file()), places[0])
 
 
 def load_weights(module: RegistrationModule, checkpoint: Path) -> None:
@@ -228,13 +236,16 @@ def make_trainer(
         loggers.append(_wandb(folder, arm, group, mode, settings))
     return L.Trainer(
         **options, logger=loggers, callbacks=callbacks, default_root_dir=folder,
-        enable_model_summary=False,
     )  # fmt: skip
 
 
 def trainer_options(settings: Settings) -> dict[str, Any]:
     """Keyword arguments of Lightning's Trainer."""
-    return {k: v for k, v in settings.trainer.as_dict().items() if k != "enable_model_summary"}
+    options = settings.trainer.as_dict()
+    options["enable_model_summary"] = False
+    if options["accelerator"] == "auto" and torch.backends.mps.is_available():
+        options["accelerator"] = "cpu"  # Apple's GPUs lack the float64 that Procrustes needs
+    return options
 
 
 def training_settings(settings: Settings) -> dict[str, Any]:

@@ -124,6 +124,9 @@ def merge(under: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
 
 def _parse(arm: str, settings: dict[str, Any], options: list[str], path: Path) -> Namespace:
     typed = parser(arm)
+    if any(option.startswith("--trainer.max_epochs") for option in options):
+        # Whoever says how many epochs means it: the recipe's steps no longer count.
+        settings = merge(settings, {"trainer": {"max_steps": -1}})
     # Both error types are jsonargparse's; either way the first line says what is wrong.
     try:
         under = typed.parse_object(settings)

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 import shutil
 import subprocess
 from pathlib import Path
@@ -71,11 +72,20 @@ def write(
     config = {"id": recipe.id, "scale": recipe.scale, "arms": settings}
     (partial / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
     report.curves_figure(record, partial / "curves.png")
-    (partial / "metrics.json").write_text(json.dumps(record, indent=1) + "\n")
+    (partial / "metrics.json").write_text(json.dumps(_finite(record), indent=1) + "\n")
     folder.mkdir(parents=True, exist_ok=True)
     for name in FILES:
         (partial / name).replace(folder / name)
     partial.rmdir()
+
+
+def _finite(value: Any) -> Any:  # noqa: ANN401
+    """Nested values with null for what is not a number: JSON knows no NaN."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def replace_text(path: Path, text: str) -> None:

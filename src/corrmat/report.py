@@ -101,15 +101,22 @@ def markdown_summary(records: Sequence[Mapping[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def markdown_table(record: Mapping[str, Any]) -> str:
-    """`table` as Markdown."""
-    heads, rows = table(record)
-    return "\n".join([_row(heads), "|" + "---|" * len(heads), *map(_row, rows)])
+def markdown_tables(records: Sequence[Mapping[str, Any]]) -> str:
+    """`table` of every record as Markdown, each under a heading."""
+    parts = []
+    for record in records:
+        heads, rows = table(record)
+        parts.append(
+            f"### {record['id']}, {record['title']}: {record['scale']}, {record['data']}\n"
+        )
+        parts += [_row(heads), "|" + "---|" * len(heads), *map(_row, rows), ""]
+    return "\n".join(parts).rstrip()
 
 
-def read_records(results: Path) -> list[dict[str, Any]]:
+def read_records(results: Path, scale: str = "*") -> list[dict[str, Any]]:
     """Every record below a folder, ordered by scale, experiment and data."""
-    records = [json.loads(path.read_text()) for path in sorted(results.glob("*/*/*/metrics.json"))]
+    found = results.glob(f"{scale}/*/*/metrics.json")
+    records = [json.loads(path.read_text()) for path in found]
     return sorted(records, key=lambda r: (r["scale"], r["id"], r["data"]))
 
 

@@ -1,0 +1,77 @@
+import re
+
+import pytest
+from conftest import ROOT
+
+from corrmat import report
+from corrmat.errors import CorrmatError
+
+RECORD = {
+    "id": "9.9",
+    "title": "a test",
+    "scale": "smoke",
+    "data": "shapes",
+    "arms": {
+        arm: {
+            "match_accuracy": accuracy,
+            "relative_euler_rmse_deg": rmse,
+            "rotation_error_deg_median": rmse / 2,
+            "translation_rmse": 0.1,
+            "chamfer": float("nan"),
+            "pairs": 8.0,
+            "pairs_seen": 32,
+            "train_seconds": 90.0,
+            "curve": [
+                {
+                    "pairs_seen": 16, "loss": 1.0, "match_accuracy": 0.1,
+                    "relative_euler_rmse_deg": 9.0, "translation_rmse": 0.3,
+                }
+            ],
+        }
+        for arm, accuracy, rmse in (("DCP", 0.25, 30.0), ("DCP_corr", 0.5, 3.0))
+    },
+    "paper": {"DCP": {"match_accuracy": 0.055}, "DCP_corr": {"match_accuracy": 0.999}},
+}  # fmt: skip
+
+
+def test_the_table_has_ours_the_papers_and_both_ratios():
+    heads, rows = report.table(RECORD)
+    found = {row[0]: row[1:] for row in rows}
+    assert heads[1:] == ["DCP", "DCP_corr", "ratio", "paper DCP", "paper DCP_corr", "paper ratio"]
+    assert found["correct matches, %"] == ["25.0", "50.0", "0.5", "5.5", "99.9", "0.0551"]
+    assert found["rotation RMSE (Euler), deg"] == ["30", "3", "10", "", "", ""]
+    assert "Chamfer distance (squared)" not in found  # not a number: not a row
+    shown = report.terminal_table(RECORD)
+    assert "32 pairs in 1.5 min" in shown
+    assert len({len(line) for line in shown.splitlines() if "%" in line or "deg" in line}) == 1
+
+
+def test_refresh_writes_between_the_marks_and_nowhere_else(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("before\n<!-- results -->\nold\n<!-- /results -->\nafter\n")
+    report.refresh(page, "results", "new")
+    assert page.read_text() == "before\n<!-- results -->\nnew\n<!-- /results -->\nafter\n"
+    with pytest.raises(CorrmatError, match="has no <!-- tables -->"):
+        report.refresh(page, "tables", "new")
+
+
+def test_the_figure_is_drawn_the_same_twice(tmp_path):
+    for name in ("a.png", "b.png"):
+        report.curves_figure(RECORD, tmp_path / name)
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("page", "name", "make"),
+    [
+        ("README.md", "results", report.markdown_summary),
+        ("docs/reproduction.md", "tables", report.markdown_tables),
+    ],
+)
+def test_the_documents_say_what_the_records_say(page, name, make):
+    """Fails when a record has changed and `make docs` was not run."""
+    text = (ROOT / page).read_text()
+    shown = re.search(f"<!-- {name} -->\n(.*)\n<!-- /{name} -->", text, re.DOTALL)
+    records = report.read_records(ROOT / "results", scale="laptop")
+    assert records
+    assert shown[1] == make(records)
