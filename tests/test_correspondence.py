@@ -44,6 +44,8 @@ def test_rows_without_a_match_neither_cost_nor_pull(generator):
     assert (gradient[:, 0] == 0).all()
     torch.testing.assert_close(correspondence_loss(c, index), c.nll(index)[:, 1:].mean())
     assert correspondence_loss(c, torch.full_like(index, -1)) == 0
+    outliers = torch.where(index == -1, 9, index)  # no outlier class here: left out as well
+    torch.testing.assert_close(correspondence_loss(c, outliers), correspondence_loss(c, index))
 
 
 def test_half_precision_features_are_compared_in_float32(generator):

@@ -3,6 +3,8 @@
 import csv
 import json
 import math
+import os
+import signal
 import socket
 
 import pytest
@@ -80,14 +82,14 @@ def test_experiment_1_4_takes_the_networks_of_1_1(tmp_path, capsys):
     first = experiment.run(load("1.1"), tmp_path / "results", tmp_path / "runs")
     capsys.readouterr()
     again = experiment.run(load("1.4"), tmp_path / "results", tmp_path / "runs")
-    assert capsys.readouterr().out.count("the one that experiment 1.1 trained") == 2
+    assert capsys.readouterr().out.count("trained already: ") == 2
     for arm in first["arms"]:
         assert again["arms"][arm]["curve"] == first["arms"][arm]["curve"]
     alone = experiment.run(load("1.4"), tmp_path / "other", tmp_path / "other_runs")
     assert numbers(alone) == numbers(again)
     capsys.readouterr()
     experiment.run(load("1.4", "--optimizer.lr", "1e-4"), tmp_path / "results", tmp_path / "runs")
-    assert "trained" not in capsys.readouterr().out  # other settings: not the same network
+    assert "trained already" not in capsys.readouterr().out  # other settings: not the same network
 
 
 def test_the_real_part_runs_by_the_same_command(tmp_path):
@@ -98,46 +100,103 @@ def test_the_real_part_runs_by_the_same_command(tmp_path):
     assert str(shared("data")) not in config
 
 
-def stop_at(step, error, monkeypatch):
-    original = RegistrationModule.training_step
+def press_ctrl_c(during, step, patch):
+    """Ctrl-C in the middle of a training or validation step."""
+    original = getattr(RegistrationModule, during)
 
-    def training_step(self, batch, batch_index):
-        if self.global_step == step:
-            raise error
-        return original(self, batch, batch_index)
+    def interrupted(self, batch, batch_index):
+        found = original(self, batch, batch_index)
+        if self.global_step == step and batch_index != 1:
+            patch.undo()
+            os.kill(os.getpid(), signal.SIGINT)
+        return found
 
-    monkeypatch.setattr(RegistrationModule, "training_step", training_step)
+    patch.setattr(RegistrationModule, during, interrupted)
 
 
-def test_ctrl_c_leaves_a_checkpoint_and_the_same_command_goes_on(tmp_path, monkeypatch, capsys):
-    found = load("1.1", arms=["DCP_corr"])
-    settings, folder = found.settings["DCP_corr"], tmp_path / "DCP_corr"
+@pytest.mark.parametrize(
+    ("during", "step", "workers"),
+    [
+        ("training_step", 5, 0),
+        ("training_step", 8, 0),  # the last batch of an epoch
+        ("training_step", 13, 0),
+        ("training_step", 13, 2),
+        ("validation_step", 12, 0),
+    ],
+)
+def test_ctrl_c_and_the_same_command_end_as_if_nothing_had_been(
+    during, step, workers, tmp_path, capsys
+):
+    options = ["--trainer.max_steps", "20", "--data.num_workers", str(workers)]
+    settings, folder = load("1.1", *options).settings["DCP_corr"], tmp_path / "DCP_corr"
     whole = experiment.train("DCP_corr", settings, tmp_path / "whole")
-    with monkeypatch.context() as patch:
-        stop_at(6, KeyboardInterrupt(), patch)
-        with pytest.raises(SystemExit) as stopped:
-            experiment.train("DCP_corr", settings, folder)
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as stopped:  # noqa: PT012
+        press_ctrl_c(during, step, patch)
+        experiment.train("DCP_corr", settings, folder)
     assert stopped.value.code == 1
-    assert "interrupted at step 6" in capsys.readouterr().out
-    assert (folder / "last.ckpt").is_file()
+    assert "the same command goes on from there" in capsys.readouterr().out
     assert not (folder / "trained.json").exists()
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # Lightning leaves it ignored
     trained = experiment.train("DCP_corr", settings, folder)
     assert "going on from" in capsys.readouterr().out
-    assert trained.pairs_seen == whole.pairs_seen == 32
+    assert trained.pairs_seen == whole.pairs_seen == 80
     assert trained.curve == whole.curve
-    weights = [torch.load(t.checkpoint, weights_only=True)["state_dict"] for t in (whole, trained)]
-    assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
+    for name in ("best.ckpt", "last.ckpt"):
+        weights = [
+            torch.load(t / name, weights_only=True)["state_dict"]
+            for t in (tmp_path / "whole", folder)
+        ]
+        assert all(torch.equal(weights[0][key], weights[1][key]) for key in weights[0])
 
 
-def test_other_settings_do_not_go_on_from_an_old_checkpoint(tmp_path, monkeypatch, capsys):
-    with monkeypatch.context() as patch:
-        stop_at(5, KeyboardInterrupt(), patch)
-        with pytest.raises(SystemExit):
-            experiment.train("DCP", load("1.1").settings["DCP"], tmp_path / "DCP")
+def test_other_settings_do_not_go_on_from_an_old_checkpoint(tmp_path, capsys):
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit):  # noqa: PT012
+        press_ctrl_c("training_step", 5, patch)
+        experiment.train("DCP", load("1.1").settings["DCP"], tmp_path / "DCP")
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     capsys.readouterr()
     settings = load("1.1", "--optimizer.lr", "1e-4").settings["DCP"]
     experiment.train("DCP", settings, tmp_path / "DCP")
     assert "going on" not in capsys.readouterr().out
+
+
+def test_an_arm_that_was_finished_is_not_trained_again_before_its_record(tmp_path, capsys):
+    """Ctrl-C in the second arm costs nothing of the first; a recorded run starts anew."""
+    found = load("1.1")
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit):  # noqa: PT012
+        train = experiment.train
+
+        def second_is_stopped(arm, *rest, **named):
+            if arm == "DCP_corr":
+                press_ctrl_c("training_step", 3, patch)
+            return train(arm, *rest, **named)
+
+        patch.setattr(experiment, "train", second_is_stopped)
+        experiment.run(found, tmp_path / "results", tmp_path / "runs")
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    assert not (tmp_path / "results").exists()
+    capsys.readouterr()
+    record = experiment.run(found, tmp_path / "results", tmp_path / "runs")
+    shown = capsys.readouterr().out
+    assert shown.count("trained already") == shown.count("going on from") == 1
+    again = experiment.run(found, tmp_path / "results", tmp_path / "runs")
+    assert "trained already" not in capsys.readouterr().out
+    assert numbers(again) == numbers(record)
+
+
+def test_the_last_step_is_validated_wherever_it_falls(tmp_path):
+    settings = load("1.1", "--trainer.max_steps", "6").settings["DCP"]
+    trained = experiment.train("DCP", settings, tmp_path / "DCP")
+    assert [point["pairs_seen"] for point in trained.curve] == [16, 24]
+
+
+def test_nothing_is_deleted_or_trained_when_the_test_split_cannot_be_read(tmp_path):
+    found = load("1.1")
+    experiment.run(found, tmp_path / "results", tmp_path / "runs")
+    for bad in (["--data.test_shapes", "801"], ["--trainer.accelerator", "warp"], ["--seed", "-1"]):
+        with pytest.raises(CorrmatError):
+            experiment.run(load("1.1", *bad), tmp_path / "results", tmp_path / "runs")
+    assert (tmp_path / "runs/smoke/shapes/1.1/DCP/best.ckpt").is_file()
 
 
 def test_a_loss_that_is_no_number_stops_the_run_and_leaves_no_record(tmp_path, monkeypatch):

@@ -1,5 +1,7 @@
 """What happens beside the training step: the curve that figures show, and Ctrl-C."""
 
+import signal
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -44,6 +46,8 @@ class Curve(Callback):
         """Count."""
         self.pairs += len(batch)
         self._losses.append(outputs["loss"].detach())
+        if trainer.global_step >= trainer.estimated_stepping_batches:
+            trainer.should_stop = True  # so that the last weights are validated too
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Add a point, and say it."""
@@ -94,22 +98,59 @@ class Curve(Callback):
 
 
 class SaveOnInterrupt(Callback):
-    """Ctrl-C leaves a checkpoint and says how to go on."""
+    """Ctrl-C or SIGTERM leaves a checkpoint between two steps and says how to go on.
+
+    The signal is only noted; the step or validation under way is finished first, so that the
+    checkpoint holds a whole number of steps. A second Ctrl-C does not wait.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._noted, self._hurried = False, False
+        self._before: dict[signal.Signals, Any] = {}
+
+    def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Take over the signals, where that is possible."""
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._before[number] = signal.signal(number, self._note)
+
+    def on_train_batch_start(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, batch: PairBatch, batch_idx: int
+    ) -> None:
+        """Stop here, before the step has touched anything."""
+        if self._noted:
+            raise KeyboardInterrupt
 
     def on_exception(
         self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException
     ) -> None:
         """Lightning calls this before it gives up."""
+        self._give_back()
         if isinstance(exception, KeyboardInterrupt):
-            # The batch under way does not count, or all later validations come one too early.
-            total = trainer.fit_loop.epoch_loop.batch_progress.total
-            total.ready = total.completed
-            trainer.save_checkpoint(self.path)
-            say(f"interrupted at step {trainer.global_step}; saved {self.path}")
+            if self._noted and not self._hurried:
+                # The batch under way does not count, or later validations come one too early.
+                total = trainer.fit_loop.epoch_loop.batch_progress.total
+                total.ready = total.completed
+                trainer.save_checkpoint(self.path)
+            say(f"interrupted at step {trainer.global_step}; checkpoint: {self.path}")
             say("the same command goes on from there")
+
+    def on_fit_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Give the signals back."""
+        self._give_back()
+
+    def _note(self, number: int, frame: object) -> None:
+        self._hurried = self._noted
+        if self._hurried:
+            raise KeyboardInterrupt
+        self._noted = True
+        say("stopping after this step (once more to stop at once)")
+
+    def _give_back(self) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        self._before.clear()
 
 
 def say(text: str) -> None:

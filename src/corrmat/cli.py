@@ -104,7 +104,10 @@ def _experiment_options(command: argparse.ArgumentParser, name: str) -> None:
 def _experiment(known: argparse.Namespace, options: list[str]) -> int:
     # Imported here, so that --help and mistakes do not wait for torch.
     from corrmat import experiment, metrics, recipe
+    from corrmat.methods import METHODS
 
+    if getattr(known, "arm", "DCP") not in METHODS:
+        raise CorrmatError(f"unknown arm {known.arm!r}; known: {', '.join(METHODS)}")
     if known.help:
         print(known.usage_text)
         print(recipe.parser(getattr(known, "arm", "DCP_corr")).format_help().split("\n\n", 1)[1])

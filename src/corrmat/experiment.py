@@ -6,15 +6,18 @@ import os
 import shutil
 import sys
 import warnings
+import zlib
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import lightning as L
+import numpy as np
 import torch
 import yaml
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint, TQDMProgressBar
 from lightning.pytorch.loggers import CSVLogger, Logger, WandbLogger
+from lightning.fabric.utilities.exceptions import MisconfigurationException
 from torch import Tensor
 
 from corrmat import record, report
@@ -27,6 +30,7 @@ from corrmat.recipe import Recipe
 
 Settings = Any  # jsonargparse.Namespace with seed, data, network, optimizer, trainer
 BEST = "val/rotation_error_deg_mean"
+RECORDED = "recorded"  # marks an arm whose record is written: the next run trains anew
 
 
 @dataclass
@@ -52,10 +56,12 @@ def run(recipe: Recipe, results: Path, runs: Path) -> dict[str, Any]:
         The record, as in metrics.json.
     """
     place = Path(recipe.scale, recipe.data, recipe.id)
+    for arm, settings in recipe.settings.items():
+        check(arm, settings)
     arms, rows = {}, []
     for arm, settings in recipe.settings.items():
         say(f"\n{recipe.id} {arm} ({recipe.scale}, {recipe.data})")
-        trained = _trained_elsewhere(recipe, arm, settings, runs)
+        trained = _reusable(recipe, arm, settings, runs)
         if trained is None:
             trained = train(arm, settings, runs / place / arm, group=str(place))
         tests = evaluate(arm, settings, trained.checkpoint, recipe.bands_deg)
@@ -79,6 +85,9 @@ def run(recipe: Recipe, results: Path, runs: Path) -> dict[str, Any]:
         "paper": recipe.paper,
     }
     record.write(results / place, found, recipe, rows)
+    for arm in recipe.settings:
+        if (runs / place / arm).is_dir():
+            (runs / place / arm / RECORDED).touch()
     say(report.terminal_table(found))
     say(f"record: {results / place}")
     return found
@@ -96,15 +105,15 @@ def train(arm: str, settings: Settings, folder: Path, group: str = "") -> Traine
     Raises:
         CorrmatError: bad data or settings, or a loss that is no longer a number.
     """
+    # Nothing is written before everything that can be wrong has been built.
+    check(arm, settings)
     L.seed_everything(settings.seed, workers=True, verbose=False)
     datamodule, module = make_datamodule(settings), make_module(arm, settings)
-    datamodule.setup("fit")
-    # Nothing is written before everything that can be wrong has been built.
-    stored, text = folder / "settings.yaml", yaml.safe_dump(training_settings(settings))
+    stored, text = folder / "settings.yaml", training_settings(settings)
     last, done = folder / "last.ckpt", folder / "trained.json"
     resume = last.is_file() and not done.is_file() and stored.read_text() == text
     if resume:
-        datamodule.batches_done = _batches_done(last)
+        datamodule.goes_on = _progress(last, datamodule)
         say(f"going on from {last}")
     else:
         shutil.rmtree(folder, ignore_errors=True)
@@ -114,10 +123,13 @@ def train(arm: str, settings: Settings, folder: Path, group: str = "") -> Traine
     stored.write_text(text)
 
     curve = Curve()
-    best = ModelCheckpoint(
-        folder, "best", monitor=BEST, save_last=True, enable_version_counter=False
-    )
-    trainer = make_trainer(settings, folder, [curve, best, SaveOnInterrupt(last)], arm, group)
+    callbacks = [
+        curve,
+        ModelCheckpoint(folder, "best", monitor=BEST, enable_version_counter=False),
+        ModelCheckpoint(folder, "last", enable_version_counter=False),
+        SaveOnInterrupt(last),
+    ]
+    trainer = make_trainer(settings, folder, callbacks, arm, group)
     trainer.fit(module, datamodule, ckpt_path=last if resume else None, weights_only=True)
     for logger in trainer.loggers:
         if isinstance(logger, WandbLogger):
@@ -186,10 +198,9 @@ def make_module(arm: str, settings: Settings) -> RegistrationModule:
 
 def best_checkpoint(recipe: Recipe, arm: str, runs: Path) -> Path:
     """Where the best weights of an arm lie: its own, or those of `networks_of`."""
-    places = [Path(runs, recipe.scale, recipe.data, recipe.id, arm, "best.ckpt")]
-    if recipe.networks_of is not None:
-        places.append(Path(runs, recipe.scale, recipe.data, recipe.networks_of, arm, "best.ckpt"))
-    return next((path for path in places if path.is_file()), places[0])
+    folder = runs / recipe.scale / recipe.data
+    places = [folder / i / arm / "best.ckpt" for i in (recipe.networks_of, recipe.id) if i]
+    return next((path for path in places if path.is_file()), places[-1])
 
 
 def load_weights(module: RegistrationModule, checkpoint: Path) -> None:
@@ -215,7 +226,7 @@ def quieten() -> None:
     for message in (
         "isinstance.treespec, LeafSpec",
         "Checkpoint directory",  # ours holds the logs already
-        "resuming from a checkpoint that ended before the epoch",  # `batches_done` sees to it
+        "resuming from a checkpoint that ended before the epoch",  # `goes_on` sees to it
         "does not have many workers",
     ):
         warnings.filterwarnings("ignore", message=f".*{message}")
@@ -242,24 +253,46 @@ def make_trainer(
 def trainer_options(settings: Settings) -> dict[str, Any]:
     """Keyword arguments of Lightning's Trainer."""
     options = settings.trainer.as_dict()
-    options["enable_model_summary"] = False
+    options |= {"enable_model_summary": False, "enable_checkpointing": True}
     if options["accelerator"] == "auto" and torch.backends.mps.is_available():
         options["accelerator"] = "cpu"  # Apple's GPUs lack the float64 that Procrustes needs
     return options
 
 
-def training_settings(settings: Settings) -> dict[str, Any]:
-    """What decides how an arm is trained: everything but where the data lies and what is tested."""
+def training_settings(settings: Settings) -> str:
+    """What decides how an arm is trained, as YAML: settings and a checksum of the shapes.
+
+    Not in it: where the data lies, how many processes read it, and what is tested.
+    """
     plain = report.plain(settings.as_dict())
-    return plain | {
-        "data": {k: v for k, v in plain["data"].items() if k not in ("root", "test_shapes")}
-    }
+    for name in ("root", "num_workers", "test_shapes"):
+        del plain["data"][name]
+    rows = make_datamodule(settings).clouds("train").rows
+    plain["data"]["checksum"] = f"{zlib.crc32(np.ascontiguousarray(rows).data):08x}"
+    return yaml.safe_dump(plain, sort_keys=False)
 
 
-def _batches_done(checkpoint: Path) -> int:
-    """How many batches of its epoch a checkpoint has seen."""
+def check(arm: str, settings: Settings) -> None:
+    """Build everything that settings can get wrong, before a run deletes or writes anything.
+
+    Raises:
+        CorrmatError: data that cannot be read, a network or Trainer that cannot be built.
+    """
+    make_module(arm, settings)
+    make_datamodule(settings).setup()
+    try:
+        L.Trainer(**trainer_options(settings), logger=False)
+    except (MisconfigurationException, ValueError, TypeError) as error:
+        first = str(error).splitlines()[0]
+        raise CorrmatError(f"no Trainer of these --trainer options: {first}") from error
+
+
+def _progress(checkpoint: Path, datamodule: RegistrationDataModule) -> dict[str, int]:
+    """The epoch that a checkpoint was written in, and how many of its items it has seen."""
     content = torch.load(checkpoint, map_location="cpu", weights_only=True)
-    return content["loops"]["fit_loop"]["epoch_loop.batch_progress"]["current"]["completed"]
+    seen = content["loops"]["fit_loop"]["epoch_loop.batch_progress"]["current"]["completed"]
+    seen %= len(datamodule.train_dataloader())  # a whole epoch seen: the next one is whole too
+    return {"epoch": content["epoch"], "done": seen * datamodule.batch_size}
 
 
 def _wandb(folder: Path, arm: str, group: str, mode: str, settings: Settings) -> WandbLogger:
@@ -277,14 +310,18 @@ def _wandb(folder: Path, arm: str, group: str, mode: str, settings: Settings) ->
     return logger
 
 
-def _trained_elsewhere(recipe: Recipe, arm: str, settings: Settings, runs: Path) -> Trained | None:
-    """The same arm trained to the end, with the same settings, by the experiment named."""
-    if recipe.networks_of is None:
-        return None
-    folder = runs / recipe.scale / recipe.data / recipe.networks_of / arm
-    done, stored = folder / "trained.json", folder / "settings.yaml"
-    if not done.is_file() or yaml.safe_load(stored.read_text()) != training_settings(settings):
-        return None
-    say(f"the network is the one that experiment {recipe.networks_of} trained: {folder}")
-    content = json.loads(done.read_text())
-    return Trained(**content | {"checkpoint": folder / content["checkpoint"]})
+def _reusable(recipe: Recipe, arm: str, settings: Settings, runs: Path) -> Trained | None:
+    """The same arm, already trained to the end with the same settings.
+
+    Either by the experiment that `networks_of` names, or by this one, if it was stopped
+    before its record was written.
+    """
+    for identity in filter(None, (recipe.networks_of, recipe.id)):
+        folder = runs / recipe.scale / recipe.data / identity / arm
+        done, stored = folder / "trained.json", folder / "settings.yaml"
+        recorded = identity == recipe.id and (folder / RECORDED).exists()
+        if done.is_file() and not recorded and stored.read_text() == training_settings(settings):
+            say(f"trained already: {folder}")
+            content = json.loads(done.read_text())
+            return Trained(**content | {"checkpoint": folder / content["checkpoint"]})
+    return None

@@ -26,7 +26,8 @@ def transformation_loss(
         A scalar.
     """
     identity = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
-    turned = (rotation.mT @ true_rotation - identity).square().mean()
+    with torch.autocast(rotation.device.type, enabled=False):
+        turned = (rotation.mT @ true_rotation - identity).square().mean()
     return turned + (translation - true_translation).square().mean()
 
 
@@ -35,12 +36,12 @@ def correspondence_loss(c: SoftCorrespondence, match: Tensor) -> Tensor:
 
     Args:
         c: the predicted matrix, N rows.
-        match: (B, N) int64, the class of each row; -1 where there is none.
+        match: (B, N) int64, the class of each row; rows without one do not count.
 
     Returns:
         A scalar.
     """
-    return c.nll(match).sum() / (match >= 0).sum().clamp_min(1)
+    return c.nll(match).sum() / c.is_class(match).sum().clamp_min(1)
 
 
 class TransformationLoss:

@@ -33,6 +33,17 @@ class OptimizerSettings:
     gamma: float = 0.25
     warmup: float = 0.1
 
+    def __post_init__(self) -> None:
+        checks = {
+            "lr": self.lr > 0,
+            "weight_decay": self.weight_decay >= 0,
+            "gamma": self.gamma > 0,
+            "warmup": 0 < self.warmup < 1,
+        }
+        for name, fine in checks.items():
+            if not fine:
+                raise CorrmatError(f"{name} = {getattr(self, name)} is out of range")
+
 
 class RegistrationModule(L.LightningModule):
     """A network and its optimizer; a loss mixin in front of it makes a method.

@@ -32,7 +32,9 @@ _TOP = {
     "seed",
     *GROUPS,
 }
-_NOT_TRAINER: set[str | int] = {
+_NOT_TRAINER: set[str | int] = {  # ours to decide
+    "enable_checkpointing",
+    "enable_model_summary",
     "logger",
     "callbacks",
     "default_root_dir",
@@ -146,7 +148,11 @@ def _first_line(error: Exception) -> str:
 
 
 def _scale(recipe: dict[str, Any], scale: str) -> dict[str, Any]:
-    return recipe.get("scales", {}).get(scale) or {}
+    scales = recipe.get("scales") or {}
+    for name in scales:
+        if name not in SCALES:
+            raise CorrmatError(f"unknown scale {name!r}; known: {', '.join(SCALES)}")
+    return scales.get(scale) or {}
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -126,6 +126,8 @@ def refresh(path: Path, name: str, content: str) -> None:
     Raises:
         CorrmatError: the marks are not there.
     """
+    if not path.is_file():
+        raise CorrmatError(f"no {path} to write into")
     text = path.read_text()
     start, end = f"<!-- {name} -->", f"<!-- /{name} -->"
     if start not in text or end not in text:

@@ -41,8 +41,9 @@ class Prediction:
     rotation: Tensor  # (B, 3, 3)
     translation: Tensor  # (B, 3)
     correspondence: SoftCorrespondence | None = None  # None for networks that regress the pose
-    steps: "list[Prediction] | None" = None  # one an iteration; the single step is the prediction
+    earlier: "tuple[Prediction, ...]" = ()  # of an iterative network: one an iteration before
 
-    def __post_init__(self) -> None:
-        if self.steps is None:
-            self.steps = [self]
+    @property
+    def steps(self) -> "list[Prediction]":
+        """One prediction an iteration, this one last."""
+        return [*self.earlier, self]

@@ -7,6 +7,7 @@ from typing import Literal
 
 import lightning as L
 import numpy as np
+import torch
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from corrmat.data import modelnet40, shapes
@@ -45,8 +46,8 @@ class EpochSampler(Sampler[tuple[int, int]]):
     A run that goes on in the middle of an epoch leaves out the first `done` items, once.
     """
 
-    def __init__(self, size: int, seed: int, shuffle: bool, done: int = 0) -> None:
-        self.size, self.seed, self.shuffle, self.done, self.epoch = size, seed, shuffle, done, 0
+    def __init__(self, size: int, seed: int, shuffle: bool, epoch: int = 0, done: int = 0) -> None:
+        self.size, self.seed, self.shuffle, self.epoch, self.done = size, seed, shuffle, epoch, done
 
     def set_epoch(self, epoch: int) -> None:
         """Lightning calls this before every epoch; frozen pairs stay in epoch 0."""
@@ -116,7 +117,16 @@ class RegistrationDataModule(L.LightningDataModule):
         self.data, self.root, self.categories = data, root, categories
         self.counts = {"train": train_shapes, "test": test_shapes}
         self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed
-        self.batches_done = 0  # of the epoch in whose middle a run goes on
+        self.goes_on = {"epoch": 0, "done": 0}  # where in training: for `EpochSampler`
+        for name, value, least in (
+            ("batch_size", batch_size, 1),
+            ("num_workers", num_workers, 0),
+            ("seed", seed, 0),
+            ("train_shapes", train_shapes, 1),
+            ("test_shapes", test_shapes, 1),
+        ):
+            if value is not None and value < least:
+                raise CorrmatError(f"{name} = {value} is out of range")
         self._clouds: dict[str, CloudSet] = {}
 
     def setup(self, stage: str | None = None) -> None:
@@ -158,15 +168,13 @@ class RegistrationDataModule(L.LightningDataModule):
             dataset,
             batch_size=self.batch_size,
             sampler=EpochSampler(
-                len(dataset),
-                self.seed,
-                shuffle=training,
-                done=self.batches_done * self.batch_size if training else 0,
+                len(dataset), self.seed, training, **(self.goes_on if training else {})
             ),
             num_workers=self.num_workers,
             collate_fn=_as_is,  # pyright: ignore[reportArgumentType] (__getitems__ makes the batch)
             drop_last=training and len(dataset) >= self.batch_size,
             persistent_workers=self.num_workers > 0,
+            pin_memory=torch.cuda.is_available(),
         )
 
     def _read(self, split: Literal["train", "test"]) -> CloudSet:

@@ -149,7 +149,9 @@ class _LinearReluMax(torch.autograd.Function):
     def backward(ctx, grad_out: Tensor | None, grad_top: Tensor | None):  # type: ignore[override]  # noqa: ANN001, ANN205
         rows, weight, out, top = ctx.saved_tensors
         grad_rows = torch.empty_like(rows) if ctx.needs_input_grad[0] else None
-        grad_weight, grad_bias = torch.zeros_like(weight), torch.zeros_like(weight[:, 0])
+        wide = torch.promote_types(weight.dtype, torch.float32)  # the sums over slabs
+        grad_weight = torch.zeros_like(weight, dtype=wide)
+        grad_bias = torch.zeros_like(weight[:, 0], dtype=wide)
         left = torch.zeros_like(top) if grad_top is None else grad_top.clone()
         grad = torch.empty_like(top)
         for j, (slab, result) in enumerate(zip(rows, out, strict=True)):
@@ -159,8 +161,8 @@ class _LinearReluMax(torch.autograd.Function):
             if grad_out is not None:
                 grad += grad_out[j]
             torch.ops.aten.threshold_backward.grad_input(grad, result, 0, grad_input=grad)
-            grad_weight.addmm_(grad.T, slab)
+            grad_weight += grad.T @ slab
             grad_bias += grad.sum(0)
             if grad_rows is not None:
                 torch.mm(grad, weight, out=grad_rows[j])
-        return grad_rows, grad_weight, grad_bias
+        return grad_rows, grad_weight.to(weight.dtype), grad_bias.to(weight.dtype)

@@ -44,18 +44,25 @@ class SoftCorrespondence:
 
     def soft_target(self, y: Tensor) -> Tensor:
         """(B, N, 3): Y_hat = C Y, the expected match of each source point, for y (B, M, 3)."""
-        return self.prob() @ y.to(self._logits.dtype)
+        with torch.autocast(y.device.type, enabled=False):
+            return self.prob() @ y.to(self._logits.dtype)
 
     def nll(self, index: Tensor) -> Tensor:
         """Cross-entropy of each row against its true match (paper section 4, L_CE).
 
         Args:
-            index: (B, N) int64, the true target index; -1 where a point has no match.
+            index: (B, N) int64, the true target index; anything that is no class of this
+                matrix (-1 for no match, M for an outlier) is left out.
 
         Returns:
-            (B, N) negative log-likelihoods; 0 where there is no match.
+            (B, N) negative log-likelihoods; 0 for rows left out.
         """
+        index = torch.where(self.is_class(index), index, -1)
         return F.cross_entropy(self._logits.mT, index, ignore_index=-1, reduction="none")
+
+    def is_class(self, index: Tensor) -> Tensor:
+        """Which of these indices, of any shape, name a class of this matrix."""
+        return (index >= 0) & (index < self.feature_target.shape[1])
 
 
 def _at_least_float32(feature: Tensor) -> Tensor:

@@ -18,7 +18,8 @@ def apply(rotation: Tensor, translation: Tensor, points: Tensor) -> Tensor:
     Returns:
         (..., N, 3), `R @ x + t` for every point x.
     """
-    return points @ rotation.mT + translation.unsqueeze(-2)
+    with torch.autocast(points.device.type, enabled=False):
+        return points @ rotation.mT + translation.unsqueeze(-2)
 
 
 def compose(outer: tuple[Tensor, Tensor], inner: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
