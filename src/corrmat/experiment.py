@@ -15,9 +15,9 @@ import lightning as L
 import numpy as np
 import torch
 import yaml
+from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint, TQDMProgressBar
 from lightning.pytorch.loggers import CSVLogger, Logger, WandbLogger
-from lightning.fabric.utilities.exceptions import MisconfigurationException
 from torch import Tensor
 
 from corrmat import record, report
@@ -298,16 +298,19 @@ def _progress(checkpoint: Path, datamodule: RegistrationDataModule) -> dict[str,
 def _wandb(folder: Path, arm: str, group: str, mode: str, settings: Settings) -> WandbLogger:
     import wandb  # starts slowly, and not everybody wants it
 
-    os.environ.setdefault("WANDB_SILENT", "true")  # else it talks before it reads its settings
-    quiet = wandb.Settings(
-        silent=True, console="off", disable_git=True, save_code=False, x_disable_stats=True
+    run = wandb.init(
+        project="corrmat",
+        name=f"{group}/{arm}",
+        group=group,
+        job_type=arm,
+        dir=folder,
+        mode="online" if mode == "online" else "offline",
+        config=report.plain(settings.as_dict()),
+        settings=wandb.Settings(
+            silent=True, console="off", disable_git=True, save_code=False, x_disable_stats=True
+        ),
     )
-    logger = WandbLogger(
-        project="corrmat", name=f"{group}/{arm}", group=group, job_type=arm, save_dir=folder,
-        offline=mode != "online", settings=quiet,
-    )  # fmt: skip
-    logger.log_hyperparams(report.plain(settings.as_dict()))
-    return logger
+    return WandbLogger(experiment=run)
 
 
 def _reusable(recipe: Recipe, arm: str, settings: Settings, runs: Path) -> Trained | None:
