@@ -1,8 +1,7 @@
 """DGCNN's edge convolutions over one fixed neighbour graph, as DCP uses them (SPEC: 3, DCP).
 
-A plain rewrite spends its time on memory traffic: every edge tensor is B * N * k rows, and
-batch norm, ReLU and the maximum over neighbours pass over it again and again. Here batch
-norm costs no pass at all. The mean and variance of a linear layer's output follow from the
+Every edge tensor is B * N * k rows, and in a plain rewrite batch norm, ReLU and the maximum
+over neighbours pass over it again and again. Here batch norm costs no pass. The mean and variance of a linear layer's output follow from the
 mean and second moment of its input, so the norm is folded into the weights before the one
 matrix product; ReLU and the maximum are done slab by slab while a slab is in cache.
 """
