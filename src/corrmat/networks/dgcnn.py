@@ -1,9 +1,10 @@
 """DGCNN's edge convolutions over one fixed neighbour graph, as DCP uses them (SPEC: 3, DCP).
 
 Every edge tensor is B * N * k rows, and in a plain rewrite batch norm, ReLU and the maximum
-over neighbours pass over it again and again. Here batch norm costs no pass. The mean and variance of a linear layer's output follow from the
-mean and second moment of its input, so the norm is folded into the weights before the one
-matrix product; ReLU and the maximum are done slab by slab while a slab is in cache.
+over neighbours pass over it again and again. Here batch norm costs no pass: the mean and
+variance of a linear layer's output follow from the mean and second moment of its input, so
+the norm is folded into the weights before the one matrix product; ReLU and the maximum are
+done slab by slab while a slab is in cache.
 """
 
 from typing import NamedTuple
