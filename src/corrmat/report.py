@@ -1,5 +1,6 @@
 """Records become tables and figures. Numbers come from results/ and from nowhere else."""
 
+import itertools
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -84,21 +85,25 @@ def terminal_table(record: Mapping[str, Any]) -> str:
 
 
 def markdown_summary(records: Sequence[Mapping[str, Any]]) -> str:
-    """The README's table: for every record a row an arm, then the paper's."""
+    """The README's table: for every record a row an arm, the paper's below those of one id."""
     heads = ["experiment", "data", "arm", *(METRICS[name][0] for name in README_METRICS), "minutes"]
-    lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
-    for record in records:
-        for arm, found in record["arms"].items():
-            cells = [_cell(_value(found, name), *METRICS[name][1:]) for name in README_METRICS]
-            minutes = f"{found['train_seconds'] / 60:.1f}"
-            lines.append(
-                _row([f"{record['id']} {record['scale']}", record["data"], arm, *cells, minutes])
-            )
-        for arm, found in record["paper"].items():
-            cells = [_cell(_value(found, name), *METRICS[name][1:]) for name in README_METRICS]
+    lines = [_row(heads), "|" + "---|" * len(heads)]
+    for identity, group in itertools.groupby(records, key=lambda record: record["id"]):
+        same = list(group)
+        for record in same:
+            for arm, found in record["arms"].items():
+                minutes = f"{found['train_seconds'] / 60:.1f}"
+                start = [f"{identity} {record['scale']}", record["data"], arm]
+                lines.append(_row([*start, *_readme_cells(found), minutes]))
+        for arm, found in same[0]["paper"].items():
+            cells = _readme_cells(found)
             if any(cells):
-                lines.append(_row([f"{record['id']} paper", "ModelNet40", arm, *cells, ""]))
+                lines.append(_row([f"{identity} paper", "ModelNet40", arm, *cells, ""]))
     return "\n".join(lines)
+
+
+def _readme_cells(found: Mapping[str, Any]) -> list[str]:
+    return [_cell(_value(found, name), *METRICS[name][1:]) for name in README_METRICS]
 
 
 def markdown_tables(records: Sequence[Mapping[str, Any]]) -> str:
