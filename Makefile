@@ -8,14 +8,14 @@ UV_VERSION := 0.13.9
 
 export PYTHONUNBUFFERED := 1
 BIN := .venv/bin
-EXPERIMENTS := exp1.1 exp1.2 exp1.3 exp1.4
+EXPERIMENTS := exp1.1 exp1.2 exp1.3 exp1.4 exp2.1 exp2.2 exp2.3 exp2.4 exp3.1 exp3.2 exp3.3
 RUN_OPTIONS = --scale $(SCALE) --data.data $(DATA) $(if $(ROOT),--data.root "$(ROOT)") $(ARGS)
 
 .PHONY: help $(EXPERIMENTS) all smoke docs bench lint format test test-slow lock clean
 
 help:  ## list the targets
 	@echo "make TARGET [SCALE=smoke|laptop|paper] [DATA=shapes|modelnet40] [ROOT=folder] [ARGS='--key value']"
-	@grep -hE '^[a-z$$()_A-Z0-9.-]+:.*##' $(MAKEFILE_LIST) | sed 's/\$$(EXPERIMENTS)/exp1.1 ... exp1.4/; s/:.*##/\t/' | expand -t 22
+	@grep -hE '^[a-z$$()_A-Z0-9.-]+:.*##' $(MAKEFILE_LIST) | sed 's/\$$(EXPERIMENTS)/exp1.1 ... exp3.3/; s/:.*##/\t/' | expand -t 22
 
 $(EXPERIMENTS): exp%: .venv/ready  ## train both arms of an experiment, print ours beside the paper's
 	$(BIN)/python reproduce/exp$(subst .,_,$*).py $(RUN_OPTIONS)

@@ -4,6 +4,7 @@ import csv
 import json
 import math
 import os
+import re
 import signal
 import socket
 
@@ -21,6 +22,10 @@ IDS = [path.stem for path in sorted((ROOT / "configs" / "exp").glob("*.yaml"))]
 def load(identity, *options, arms=None):
     path = ROOT / "configs" / "exp" / f"{identity}.yaml"
     return recipe.load(path, "smoke", ["--trainer.enable_progress_bar", "false", *options], arms)
+
+
+def train(name, settings, folder):
+    return experiment.train(experiment.prepare(name, settings), folder)
 
 
 def numbers(record):
@@ -51,7 +56,10 @@ def test_smoke_run_leaves_a_whole_record(identity, tmp_path, capsys):
         assert len(arm.get("bands", [])) == (bands if bands > 1 else 0)
         assert 0 < arm["rotation_error_deg_mean"] < 180
     rows = list(csv.DictReader((folder / "per_pair.csv").open()))
-    assert len(rows) == 2 * 8 * bands
+    tested = [*found.settings, *found.baselines]
+    assert len(rows) == len(tested) * 8 * bands
+    assert list(dict.fromkeys(row["arm"] for row in rows)) == tested
+    assert list(record["baselines"]) == list(found.baselines)
     assert (folder / "curves.png").read_bytes().startswith(b"\x89PNG")
     assert "correct matches, %" in capsys.readouterr().out
     assert not list((tmp_path / "results").rglob("*.partial"))
@@ -129,15 +137,15 @@ def test_ctrl_c_and_the_same_command_end_as_if_nothing_had_been(
 ):
     options = ["--trainer.max_steps", "20", "--data.num_workers", str(workers)]
     settings, folder = load("1.1", *options).settings["DCP_corr"], tmp_path / "DCP_corr"
-    whole = experiment.train("DCP_corr", settings, tmp_path / "whole")
+    whole = train("DCP_corr", settings, tmp_path / "whole")
     with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as stopped:  # noqa: PT012
         press_ctrl_c(during, step, patch)
-        experiment.train("DCP_corr", settings, folder)
+        train("DCP_corr", settings, folder)
     assert stopped.value.code == 1
     assert "the same command goes on from there" in capsys.readouterr().out
     assert not (folder / "trained.json").exists()
     signal.signal(signal.SIGINT, signal.default_int_handler)  # Lightning leaves it ignored
-    trained = experiment.train("DCP_corr", settings, folder)
+    trained = train("DCP_corr", settings, folder)
     assert "going on from" in capsys.readouterr().out
     assert trained.pairs_seen == whole.pairs_seen == 80
     assert trained.curve == whole.curve
@@ -152,11 +160,11 @@ def test_ctrl_c_and_the_same_command_end_as_if_nothing_had_been(
 def test_other_settings_do_not_go_on_from_an_old_checkpoint(tmp_path, capsys):
     with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit):  # noqa: PT012
         press_ctrl_c("training_step", 5, patch)
-        experiment.train("DCP", load("1.1").settings["DCP"], tmp_path / "DCP")
+        train("DCP", load("1.1").settings["DCP"], tmp_path / "DCP")
     signal.signal(signal.SIGINT, signal.default_int_handler)
     capsys.readouterr()
     settings = load("1.1", "--optimizer.lr", "1e-4").settings["DCP"]
-    experiment.train("DCP", settings, tmp_path / "DCP")
+    train("DCP", settings, tmp_path / "DCP")
     assert "going on" not in capsys.readouterr().out
 
 
@@ -164,12 +172,12 @@ def test_an_arm_that_was_finished_is_not_trained_again_before_its_record(tmp_pat
     """Ctrl-C in the second arm costs nothing of the first; a recorded run starts anew."""
     found = load("1.1")
     with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit):  # noqa: PT012
-        train = experiment.train
+        original = experiment.train
 
         def second_is_stopped(arm, *rest, **named):
-            if arm == "DCP_corr":
+            if arm.name == "DCP_corr":
                 press_ctrl_c("training_step", 3, patch)
-            return train(arm, *rest, **named)
+            return original(arm, *rest, **named)
 
         patch.setattr(experiment, "train", second_is_stopped)
         experiment.run(found, tmp_path / "results", tmp_path / "runs")
@@ -186,7 +194,7 @@ def test_an_arm_that_was_finished_is_not_trained_again_before_its_record(tmp_pat
 
 def test_the_last_step_is_validated_wherever_it_falls(tmp_path):
     settings = load("1.1", "--trainer.max_steps", "6").settings["DCP"]
-    trained = experiment.train("DCP", settings, tmp_path / "DCP")
+    trained = train("DCP", settings, tmp_path / "DCP")
     assert [point["pairs_seen"] for point in trained.curve] == [16, 24]
 
 
@@ -203,13 +211,20 @@ def test_a_loss_that_is_no_number_stops_the_run_and_leaves_no_record(tmp_path, m
     original = RegistrationModule.training_step
 
     def poisoned(self, batch, batch_index):
-        if self.global_step == 3:
+        if self.global_step == 6:
             batch.source = batch.source * torch.nan
         return original(self, batch, batch_index)
 
     monkeypatch.setattr(RegistrationModule, "training_step", poisoned)
-    with pytest.raises(CorrmatError, match=r"the loss is nan at step 3 \(epoch 0, batch 3\)"):
+    with pytest.raises(CorrmatError) as stopped:
         experiment.run(load("1.1"), tmp_path / "results", tmp_path / "runs")
+    shapes = r"shapes \[\d+, \d+, \d+, \d+\]"
+    assert re.match(
+        rf"the loss is nan at step 6 \(epoch 0, batch 6, {shapes}\)", str(stopped.value)
+    )
+    last = tmp_path / "runs/smoke/shapes/1.1/DCP/last.ckpt"
+    assert str(stopped.value).endswith(f"seed 0; last good checkpoint: {last}")
+    assert torch.load(last, weights_only=True)["global_step"] == 4
     assert not (tmp_path / "results").exists()
 
 
@@ -223,7 +238,7 @@ def test_wandb_writes_offline_and_touches_no_network(tmp_path, monkeypatch):
 
     original = socket.socket.connect
     monkeypatch.setattr(socket.socket, "connect", blocked)
-    experiment.train("DCP", load("1.1").settings["DCP"], tmp_path / "DCP")
+    train("DCP", load("1.1").settings["DCP"], tmp_path / "DCP")
     logs = list((tmp_path / "DCP" / "wandb").glob("offline-run-*/*.wandb"))
     assert len(logs) == 1
     assert logs[0].stat().st_size > 0
@@ -233,8 +248,11 @@ def test_wandb_writes_offline_and_touches_no_network(tmp_path, monkeypatch):
 
 def test_checkpoints_reload_to_the_same_network(tmp_path):
     settings = load("1.1").settings["DCP_corr"]
-    trained = experiment.train("DCP_corr", settings, tmp_path / "run")
-    first, again = (experiment.evaluate("DCP_corr", settings, trained.checkpoint) for _ in range(2))
+    trained = train("DCP_corr", settings, tmp_path / "run")
+    first, again = (
+        experiment.evaluate(experiment.prepare("DCP_corr", settings), trained.checkpoint)
+        for _ in range(2)
+    )
     assert torch.equal(first[0]["transform"], again[0]["transform"])
     assert math.isfinite(float(first[0]["rotation_error_deg"].mean()))
 

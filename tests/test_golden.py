@@ -7,8 +7,17 @@ from conftest import golden, shared, state_of
 
 from corrmat import load_reference, metrics
 from corrmat.errors import CorrmatError
-from corrmat.losses import correspondence_loss, transformation_loss
-from corrmat.weights import rename_dcp
+from corrmat.losses import (
+    ChamferLoss,
+    CorrespondenceLoss,
+    RegistrationLoss,
+    correspondence_loss,
+    transformation_loss,
+)
+from corrmat.networks import rpmnet
+from corrmat.ops import rigid
+from corrmat.types import PairBatch
+from corrmat.weights import rename
 
 NAMES = ["dcp_identity", "dcp_transformer", "dcp_transformer_partial"]
 ULPS = 3e-7  # a relative change of the input that float32 rounding makes as well
@@ -86,6 +95,113 @@ def test_pretrained_dcp_v1():
     close(found.translation, outputs["translation_pred"], 1e-3)
 
 
+def as_batch(arrays):
+    nothing = torch.zeros(len(arrays["source"]))
+    return PairBatch(
+        arrays["source"], arrays["target"],
+        arrays.get("rotation", nothing), arrays.get("translation", nothing),
+        arrays.get("correspondence", nothing), arrays["source"][..., :3], nothing,
+    )  # fmt: skip
+
+
+def worst_gradient(kind, network, arrays):
+    """Largest relative error of the network's gradients, those of zero left out."""
+    errors = [
+        relative(network.get_parameter(rename(kind, name.removeprefix("grad/"))).grad, expected)
+        for name, expected in arrays.items()
+        if name.startswith("grad/") and expected.norm() > 1e-6
+    ]
+    assert errors
+    return max(errors)
+
+
+@pytest.mark.parametrize("name", ["rpmnet", "rpmnet_partial"])
+def test_rpmnet(name):
+    arrays, hparams = golden(name)
+    network = load_reference("rpmnet", state_of(arrays), **hparams)
+    with torch.no_grad():
+        found = network(arrays["source"], arrays["target"])
+    assert len(found.steps) == 2
+    for i, step in enumerate(found.steps):
+        close(step.correspondence.beta, arrays["beta"][i], 1e-4)
+        close(step.correspondence.alpha, arrays["alpha"][i], 1e-4)
+        close(step.correspondence.prob(), arrays[f"perm_matrix_{i}"], 1e-4)
+        moved = torch.cat([step.rotation, step.translation.unsqueeze(-1)], -1)
+        close(moved, arrays[f"transform_{i}"], 1e-4)
+    batch = as_batch(arrays)
+    relative_error = {"rtol": 1e-5, "atol": 0}
+    torch.testing.assert_close(
+        CorrespondenceLoss().loss(found, batch), arrays["loss_correspondence"], **relative_error
+    )
+    torch.testing.assert_close(
+        RegistrationLoss().loss(found, batch), arrays["loss_rpmnet"], **relative_error
+    )
+
+
+@pytest.mark.parametrize("name", ["rpmnet", "rpmnet_partial"])
+def test_rpmnet_gradients(name, monkeypatch):
+    """Every gradient within 1e-3 relative, with the reference's own pose between the turns.
+
+    Its float32 pose is 5e-6 off ours, and in `rpmnet` that much decides which point wins a
+    maximum of the annealing net in the second turn: 1.4 % of the gradient of its first layers.
+    """
+    arrays, hparams = golden(name)
+    network = load_reference("rpmnet", state_of(arrays), **hparams).train()
+    poses = [arrays[f"transform_{i}"] for i in range(2)]
+    monkeypatch.setattr(
+        rpmnet, "procrustes", lambda *clouds: poses.pop(0).split_with_sizes([3, 1], -1)
+    )
+    monkeypatch.setattr(rpmnet.rigid, "apply", lambda r, t, x: x @ r.mT + t.view(-1, 1, 3))
+    loss = CorrespondenceLoss().loss(network(arrays["source"], arrays["target"]), as_batch(arrays))
+    loss.backward()
+    assert worst_gradient("rpmnet", network, arrays) < 1e-3
+
+
+def test_rpmnet_gradients_as_they_are():
+    """Without the reference's pose: the partial pair agrees, the full one up to that maximum."""
+    for name, tolerance in (("rpmnet_partial", 1e-3), ("rpmnet", 2e-2)):
+        arrays, hparams = golden(name)
+        network = load_reference("rpmnet", state_of(arrays), **hparams).train()
+        found = network(arrays["source"], arrays["target"])
+        CorrespondenceLoss().loss(found, as_batch(arrays)).backward()
+        assert worst_gradient("rpmnet", network, arrays) < tolerance
+
+
+def test_pcrnet():
+    arrays, hparams = golden("pcrnet")
+    network = load_reference("pcrnet", state_of(arrays), **hparams)
+    source, target = arrays["source"], arrays["target"]
+    found = network(source, target)
+    assert len(found.steps) == hparams["iterations"]
+    close(found.rotation, arrays["est_R"], 1e-4)
+    close(found.translation, arrays["est_t"].squeeze(1), 1e-4)
+    close(
+        rigid.apply(found.rotation, found.translation, source), arrays["transformed_source"], 1e-4
+    )
+    loss = ChamferLoss().loss(found, as_batch(arrays))
+    torch.testing.assert_close(loss, arrays["loss_chamfer"], rtol=1e-3, atol=0)
+    loss.backward()
+    assert worst_gradient("pcrnet", network, arrays) < 1e-3
+
+
+def test_pcrnet_corr():
+    arrays, hparams = golden("pcrnet_corr")
+    network = load_reference("pcrnet_corr", state_of(arrays), **hparams)
+    batch, relative_error = as_batch(arrays), {"rtol": 1e-5, "atol": 0}
+    found = network(arrays["source"], arrays["target"])
+    close(found.correspondence.logits(), arrays["scores"], 1e-4)
+    close(found.rotation, arrays["rotation_pred"], 1e-4)
+    close(found.translation, arrays["translation_pred"], 1e-4)
+    torch.testing.assert_close(
+        CorrespondenceLoss().loss(found, batch), arrays["loss_correspondence"], **relative_error
+    )
+    network.train()
+    loss = CorrespondenceLoss().loss(network(arrays["source"], arrays["target"]), batch)
+    torch.testing.assert_close(loss, arrays["train_loss_correspondence"], **relative_error)
+    loss.backward()
+    assert worst_gradient("pcrnet_corr", network, arrays) < 1e-3
+
+
 def test_what_does_not_fit_is_listed():
     arrays, hparams = golden("dcp_identity")
     state = state_of(arrays)
@@ -95,8 +211,9 @@ def test_what_does_not_fit_is_listed():
         CorrmatError, match=r"edge\.0\.norm\.bias is missing.*edge\.1\.linear\.weight is \(5, 64\)"
     ):
         load_reference("dcp", state, **hparams)
-    with pytest.raises(CorrmatError, match="not a DCP checkpoint"):
-        load_reference("dcp", {"weight": torch.zeros(3)})
+    for kind in ("dcp", "rpmnet", "pcrnet", "pcrnet_corr"):
+        with pytest.raises(CorrmatError, match="^not an? .* checkpoint: .* is missing"):
+            load_reference(kind, {"weight": torch.zeros(3)})
     with pytest.raises(CorrmatError, match="no reference network of kind 'pointnetlk'"):
         load_reference("pointnetlk", state)
 
@@ -142,7 +259,7 @@ def loss_and_gradients(arrays, hparams, dtype, seed=None):
     names = [
         k.removeprefix("grad/") for k in arrays if k.startswith("grad/") and arrays[k].norm() > 1e-6
     ]
-    return loss.item(), {k: network.get_parameter(rename_dcp(k)).grad for k in names}
+    return loss.item(), {k: network.get_parameter(rename("dcp", k)).grad for k in names}
 
 
 def gradients_of_zero(arrays, hparams):
@@ -150,4 +267,4 @@ def gradients_of_zero(arrays, hparams):
     c = network(arrays["source"].double(), arrays["target"].double()).correspondence
     correspondence_loss(c, arrays["correspondence"]).backward()
     names = [k.removeprefix("grad/") for k in arrays if k.startswith("grad/")]
-    return {k: network.get_parameter(rename_dcp(k)).grad for k in names}
+    return {k: network.get_parameter(rename("dcp", k)).grad for k in names}

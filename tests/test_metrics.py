@@ -30,12 +30,27 @@ def perfect(batch):
 
 def test_a_perfect_prediction_has_the_perfect_score(batch):
     scores = metrics.RegistrationMetrics()
-    scores.update(perfect(batch), batch, with_chamfer=True)
+    scores.update(perfect(batch), batch)
     found = scores.compute()
     assert found.pop("match_accuracy") == 1
     assert found.pop("recall@5deg_0.05") == 1
     assert found.pop("pairs") == 6
+    assert math.isnan(found.pop("transposed_match_accuracy"))  # asks for clouds of one size
     assert all(value == pytest.approx(0, abs=1e-5) for value in found.values()), found
+
+
+def test_the_released_match_count_gives_a_perfect_prediction_almost_nothing():
+    """It compared the matrix with its transpose: only fixed points and swaps count."""
+    match = torch.tensor([[1, 2, 0, 3, 5, 4]])
+    assert metrics.right_matches(match, match, 6).tolist() == [6]
+    assert metrics.transposed_right_matches(match, match).tolist() == [3]
+    assert metrics.transposed_right_matches(match.argsort(), match).tolist() == [6]
+    data = RegistrationDataModule(num_points=200, batch_size=8, test_shapes=8, train_shapes=2)
+    pairs = next(iter(data.test_dataloader()))
+    scores = metrics.RegistrationMetrics()
+    scores.update(perfect(pairs), pairs)
+    assert scores.compute()["match_accuracy"] == 1
+    assert 0 < scores.compute()["transposed_match_accuracy"] < 0.03
 
 
 def test_angles_are_exact_near_zero_and_near_180():
@@ -99,9 +114,9 @@ def test_batches_of_any_size_give_one_result(batch):
     for split in ([slice(0, 6)], [slice(0, 1), slice(1, 6)]):
         scores = metrics.RegistrationMetrics()
         for rows in split:
-            scores.update(wrong(part(rows)), part(rows), with_chamfer=True)
+            scores.update(wrong(part(rows)), part(rows))
         results.append(scores.compute())
-    assert results[0] == pytest.approx(results[1], rel=1e-6)
+    assert results[0] == pytest.approx(results[1], rel=1e-6, nan_ok=True)
     assert results[0]["rotation_error_deg_mean"] > 1
 
 

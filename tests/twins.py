@@ -61,3 +61,36 @@ def chamfer_loops(
     there = [min(float(((x - y) ** 2).sum()) for y in clean_target) for x in aligned]
     back = [min(float(((y - x) ** 2).sum()) for x in clean_source) for y in target]
     return sum(there) / len(there) + sum(back) / len(back)
+
+
+def sinkhorn_padded(affinity: Tensor, iterations: int, slack: str) -> Tensor:
+    """Sinkhorn as written: a padded log matrix, rewritten by every normalisation."""
+    row, column = int(slack in ("row", "both")), int(slack == "both")
+    a = F.pad(affinity, (0, column, 0, row))
+    n, m = affinity.shape[1:]
+
+    def rows(a: Tensor) -> Tensor:
+        return torch.cat([a[:, :n] - a[:, :n].logsumexp(2, keepdim=True), a[:, n:]], 1)
+
+    def columns(a: Tensor) -> Tensor:
+        return torch.cat([a[:, :, :m] - a[:, :, :m].logsumexp(1, keepdim=True), a[:, :, m:]], 2)
+
+    for _ in range(iterations):
+        a = rows(columns(a)) if slack == "row" else columns(rows(a))
+    return a[:, :n, :m]
+
+
+def within_radius_loops(points: Tensor, radius: float, k: int) -> Tensor:
+    """Neighbours of lowest index, point by point."""
+    found = []
+    for cloud in points:
+        for i, x in enumerate(cloud):
+            near = [j for j, y in enumerate(cloud) if j != i and (x - y).norm() <= radius]
+            found.append((near + [i] * k)[:k])
+    return torch.tensor(found).view(*points.shape[:2], k)
+
+
+def chamfer_loss_dense(moved: Tensor, target: Tensor) -> Tensor:
+    """The paper's CD over the whole distance matrix."""
+    distance = (moved.unsqueeze(2) - target.unsqueeze(1)).norm(dim=-1)
+    return distance.amin(2).mean() + distance.amin(1).mean()

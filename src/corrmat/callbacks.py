@@ -1,5 +1,6 @@
 """What happens beside the training step: the curve that figures show, and Ctrl-C."""
 
+import math
 import signal
 import threading
 import time
@@ -18,7 +19,9 @@ SHOWN = (
     "rotation_error_deg_mean",
     "rotation_error_deg_median",
     "relative_euler_rmse_deg",
+    "naive_euler_rmse_deg",
     "translation_rmse",
+    "chamfer",
 )
 
 
@@ -64,7 +67,7 @@ class Curve(Callback):
         self.points.append({"pairs_seen": self.pairs, "loss": loss} | {k: values[k] for k in SHOWN})
         line = (
             f"step {trainer.global_step:6d}  {self.pairs:7,d} pairs  {self.seconds:5.0f} s  "
-            f"loss {loss:7.4f}  matches {100 * values['match_accuracy']:5.1f} %  "
+            f"loss {loss:7.4f}  {_matches(values['match_accuracy'])}"
             f"rotation {values['rotation_error_deg_mean']:7.2f} deg mean, "
             f"{values['rotation_error_deg_median']:6.2f} median"
         )
@@ -95,6 +98,11 @@ class Curve(Callback):
             now = time.monotonic()
             self.seconds += now - self._since
             self._since = now
+
+
+def _matches(share: float) -> str:
+    """Nothing for networks that match no points."""
+    return "" if math.isnan(share) else f"matches {100 * share:5.1f} %  "
 
 
 class SaveOnInterrupt(Callback):

@@ -93,7 +93,9 @@ def _experiment_options(command: argparse.ArgumentParser, name: str) -> None:
             "--results", type=Path, default=Path("results"), help="folder of records"
         )
     else:
-        command.add_argument("--arm", default="DCP_corr", help="DCP or DCP_corr (default)")
+        command.add_argument(
+            "--arm", help="one of the recipe's arms, e.g. DCP or DCP_corr (default: its last)"
+        )
     if name == "evaluate":
         command.add_argument(
             "--checkpoint", type=Path, help="default: best.ckpt of the arm's last fit or run"
@@ -106,30 +108,33 @@ def _experiment(known: argparse.Namespace, options: list[str]) -> int:
     from corrmat import experiment, metrics, recipe
     from corrmat.methods import METHODS
 
-    if getattr(known, "arm", "DCP") not in METHODS:
-        raise CorrmatError(f"unknown arm {known.arm!r}; known: {', '.join(METHODS)}")
     if known.help:
+        method = getattr(known, "arm", None) or "DCP_corr"
         print(known.usage_text)
-        print(recipe.parser(getattr(known, "arm", "DCP_corr")).format_help().split("\n\n", 1)[1])
+        print(
+            recipe.parser(method if method in METHODS else "DCP_corr")
+            .format_help()
+            .split("\n\n", 1)[1]
+        )
         return 0
     if known.config is None:
         raise CorrmatError("which experiment? --config configs/exp/1.1.yaml")
-    arms = None if known.command == "run" else [known.arm]
+    wanted = getattr(known, "arm", None)
+    arms = [wanted] if wanted else None
     experiment.quieten()
     found = recipe.load(known.config, known.scale, options, arms)
     if known.command == "run":
         experiment.run(found, known.results, known.runs)
         return 0
-    settings = found.settings[known.arm]
-    folder = known.runs / found.scale / found.data / found.id / known.arm
+    name = list(found.settings)[-1]
+    arm = experiment.prepare(name, found.settings[name])
+    folder = known.runs / found.scale / found.data / found.id / name
     if known.command == "fit":
-        trained = experiment.train(
-            known.arm, settings, folder, group=f"{found.scale}/{found.data}/{found.id}"
-        )
+        trained = experiment.train(arm, folder, group=f"{found.scale}/{found.data}/{found.id}")
         print(f"best checkpoint: {trained.checkpoint}")
         return 0
-    checkpoint = known.checkpoint or experiment.best_checkpoint(found, known.arm, known.runs)
-    tests = experiment.evaluate(known.arm, settings, checkpoint, found.bands_deg)
+    checkpoint = known.checkpoint or experiment.best_checkpoint(found, name, known.runs)
+    tests = experiment.evaluate(arm, checkpoint, found.bands_deg)
     for number, pairs in enumerate(tests):
         if found.bands_deg:
             print(f"\n{found.bands_deg[number]:g} to {found.bands_deg[number + 1]:g} deg")

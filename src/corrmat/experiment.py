@@ -21,6 +21,7 @@ from lightning.pytorch.loggers import CSVLogger, Logger, WandbLogger
 from torch import Tensor
 
 from corrmat import record, report
+from corrmat.baselines import BASELINES, UNTRAINED
 from corrmat.callbacks import Curve, SaveOnInterrupt, say
 from corrmat.data.datamodule import RegistrationDataModule
 from corrmat.errors import CorrmatError
@@ -44,6 +45,32 @@ class Trained:
     curve: list[dict[str, float]] = field(default_factory=list)
 
 
+@dataclass
+class Arm:
+    """An arm that can be trained: its settings have been tried, its shapes are read."""
+
+    name: str
+    settings: Settings
+    datamodule: RegistrationDataModule
+
+
+def prepare(name: str, settings: Settings) -> Arm:
+    """Build everything that settings can get wrong, before a run deletes or writes anything.
+
+    Raises:
+        CorrmatError: data that cannot be read, a network or Trainer that cannot be built.
+    """
+    arm = Arm(name, settings, make_datamodule(settings))
+    make_module(settings)
+    arm.datamodule.setup()
+    try:
+        L.Trainer(**trainer_options(settings), logger=False)
+    except (MisconfigurationException, ValueError, TypeError) as error:
+        first = str(error).splitlines()[0]
+        raise CorrmatError(f"no Trainer of these --trainer options: {first}") from error
+    return arm
+
+
 def run(recipe: Recipe, results: Path, runs: Path) -> dict[str, Any]:
     """Train and test every arm, and write the record at one stroke when all are done.
 
@@ -56,60 +83,61 @@ def run(recipe: Recipe, results: Path, runs: Path) -> dict[str, Any]:
         The record, as in metrics.json.
     """
     place = Path(recipe.scale, recipe.data, recipe.id)
-    for arm, settings in recipe.settings.items():
-        check(arm, settings)
-    arms, rows = {}, []
-    for arm, settings in recipe.settings.items():
-        say(f"\n{recipe.id} {arm} ({recipe.scale}, {recipe.data})")
-        trained = _reusable(recipe, arm, settings, runs)
-        if trained is None:
-            trained = train(arm, settings, runs / place / arm, group=str(place))
-        tests = evaluate(arm, settings, trained.checkpoint, recipe.bands_deg)
-        arms[arm] = record.scores(tests, recipe.bands_deg) | {
+    ready = [prepare(name, settings) for name, settings in recipe.settings.items()]
+    scores, rows = {}, []
+    for arm in ready:
+        say(f"\n{recipe.id} {arm.name} ({recipe.scale}, {recipe.data})")
+        folder = runs / place / arm.name
+        trained = _reusable(recipe, arm, runs) or train(arm, folder, group=str(place))
+        tests = evaluate(arm, trained.checkpoint, recipe.bands_deg)
+        scores[arm.name] = record.scores(tests, recipe.bands_deg) | {
             "pairs_seen": trained.pairs_seen,
             "train_seconds": round(trained.train_seconds, 1),
             "trained_at": trained.commit,
             "curve": trained.curve,
         }
-        rows += [row for band, pairs in enumerate(tests) for row in record.rows(arm, band, pairs)]
+        rows += record.rows(arm.name, tests)
+    baselines = {}
+    for name in recipe.baselines:
+        tests = score(_baseline(name, ready[-1]), ready[-1], recipe.bands_deg)
+        baselines[name] = record.scores(tests, recipe.bands_deg)
+        rows += record.rows(name, tests)
     found = {
         "id": recipe.id,
         "title": recipe.title,
         "scale": recipe.scale,
         "data": recipe.data,
-        "seed": next(iter(recipe.settings.values())).seed,
+        "seed": ready[0].settings.seed,
         "commit": record.commit(),
         "hardware": {"threads": torch.get_num_threads(), "gpu": torch.cuda.is_available()},
         "bands_deg": list(recipe.bands_deg),
-        "arms": arms,
+        "arms": scores,
+        "baselines": baselines,
         "paper": recipe.paper,
     }
     record.write(results / place, found, recipe, rows)
-    for arm in recipe.settings:
-        if (runs / place / arm).is_dir():
-            (runs / place / arm / RECORDED).touch()
+    for arm in ready:
+        if (runs / place / arm.name).is_dir():
+            (runs / place / arm.name / RECORDED).touch()
     say(report.terminal_table(found))
     say(f"record: {results / place}")
     return found
 
 
-def train(arm: str, settings: Settings, folder: Path, group: str = "") -> Trained:
+def train(arm: Arm, folder: Path, group: str = "") -> Trained:
     """Train one arm; goes on from an interrupted run of the same settings if there is one.
 
     Args:
-        arm: a key of `METHODS`.
-        settings: its seed, data, network, optimizer and trainer.
+        arm: from `prepare`.
         folder: for checkpoints (best.ckpt on validation, last.ckpt) and logs.
         group: wandb's name for the arms that belong together.
 
     Raises:
-        CorrmatError: bad data or settings, or a loss that is no longer a number.
+        CorrmatError: a loss that is no longer a number.
     """
-    # Nothing is written before everything that can be wrong has been built.
-    check(arm, settings)
-    L.seed_everything(settings.seed, workers=True, verbose=False)
-    datamodule, module = make_datamodule(settings), make_module(arm, settings)
-    stored, text = folder / "settings.yaml", training_settings(settings)
+    settings, datamodule = arm.settings, arm.datamodule
+    module = _fresh(settings)
+    stored, text = folder / "settings.yaml", training_settings(arm)
     last, done = folder / "last.ckpt", folder / "trained.json"
     resume = last.is_file() and not done.is_file() and stored.read_text() == text
     if resume:
@@ -129,8 +157,14 @@ def train(arm: str, settings: Settings, folder: Path, group: str = "") -> Traine
         ModelCheckpoint(folder, "last", enable_version_counter=False),
         SaveOnInterrupt(last),
     ]
-    trainer = make_trainer(settings, folder, callbacks, arm, group)
-    trainer.fit(module, datamodule, ckpt_path=last if resume else None, weights_only=True)
+    trainer = make_trainer(settings, folder, callbacks, arm.name, group)
+    try:
+        trainer.fit(module, datamodule, ckpt_path=last if resume else None, weights_only=True)
+    except CorrmatError as error:
+        kept = last if last.is_file() else "none yet"
+        raise CorrmatError(
+            f"{error}; seed {settings.seed}; last good checkpoint: {kept}"
+        ) from error
     for logger in trainer.loggers:
         if isinstance(logger, WandbLogger):
             logger.experiment.finish()
@@ -146,26 +180,33 @@ def train(arm: str, settings: Settings, folder: Path, group: str = "") -> Traine
 
 
 def evaluate(
-    arm: str, settings: Settings, checkpoint: Path, bands_deg: tuple[float, ...] = ()
+    arm: Arm, checkpoint: Path, bands_deg: tuple[float, ...] = ()
 ) -> list[dict[str, Tensor]]:
-    """Score a checkpoint on the frozen test pairs; per-pair values, one set a rotation band.
+    """`score` of an arm with the weights of a checkpoint."""
+    module = make_module(arm.settings)
+    load_weights(module, checkpoint)
+    return score(module, arm, bands_deg)
+
+
+def score(
+    module: RegistrationModule, arm: Arm, bands_deg: tuple[float, ...] = ()
+) -> list[dict[str, Tensor]]:
+    """Score a module on an arm's frozen test pairs; per-pair values, one set a rotation band.
 
     Without bands the pairs are drawn as in training. With bands their angles lie between
     neighbouring edges and there is no translation (tables 1 and 2 of the paper).
     """
-    datamodule, module = make_datamodule(settings), make_module(arm, settings)
-    load_weights(module, checkpoint)
     how: list[dict[str, float]] = [
         {"min_rotation_deg": low, "rotation_deg": high, "translation": 0.0}
         for low, high in zip(bands_deg, bands_deg[1:], strict=False)
     ]
-    quiet = {"logger": False, "enable_checkpointing": False}
-    trainer = L.Trainer(**{**trainer_options(settings), "enable_progress_bar": False, **quiet})
+    quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
+    trainer = L.Trainer(**{**trainer_options(arm.settings), **quiet})
     found = []
     for changes in how or [{}]:
-        trainer.test(module, datamodule.test_dataloader(**changes), verbose=False)
+        trainer.test(module, arm.datamodule.test_dataloader(**changes), verbose=False)
         found.append(module.metrics.per_pair())
-        names = datamodule.clouds("test")
+        names = arm.datamodule.clouds("test")
         found[-1]["category"] = torch.from_numpy(names.labels)[found[-1]["shape"]]
         module.metrics.reset()
     return found
@@ -176,24 +217,36 @@ def make_datamodule(settings: Settings) -> RegistrationDataModule:
     return RegistrationDataModule(**settings.data.as_dict(), seed=settings.seed)
 
 
-def make_module(arm: str, settings: Settings) -> RegistrationModule:
+def make_module(settings: Settings) -> RegistrationModule:
     """The method of these settings, freshly initialised.
 
     Raises:
         CorrmatError: the network cannot be built so, or the clouds are too small for it.
     """
-    method = METHODS[arm]
+    method = METHODS[settings.method]
     try:
-        network = method.network_type(**settings.network.as_dict())
+        network: Any = method.network_type(**settings.network.as_dict())
     except ValueError as error:
         raise CorrmatError(f"no network of these --network options: {error}") from error
     points = make_datamodule(settings).how.num_source
     if points < network.min_points:
         raise CorrmatError(
-            f"a source of {points} points is too small for {arm}, which needs "
+            f"a source of {points} points is too small for {settings.method}, which needs "
             f"{network.min_points}; raise --data.num_points or lower --network.k"
         )
     return method(network, OptimizerSettings(**settings.optimizer.as_dict()))
+
+
+def _fresh(settings: Settings) -> RegistrationModule:
+    """`make_module` with the weights that the seed gives: what training starts from."""
+    L.seed_everything(settings.seed, workers=True, verbose=False)
+    return make_module(settings)
+
+
+def _baseline(name: str, arm: Arm) -> RegistrationModule:
+    if name == UNTRAINED:
+        return _fresh(arm.settings)
+    return RegistrationModule(BASELINES[name](), OptimizerSettings())
 
 
 def best_checkpoint(recipe: Recipe, arm: str, runs: Path) -> Path:
@@ -259,32 +312,17 @@ def trainer_options(settings: Settings) -> dict[str, Any]:
     return options
 
 
-def training_settings(settings: Settings) -> str:
+def training_settings(arm: Arm) -> str:
     """What decides how an arm is trained, as YAML: settings and a checksum of the shapes.
 
     Not in it: where the data lies, how many processes read it, and what is tested.
     """
-    plain = report.plain(settings.as_dict())
+    plain = report.plain(arm.settings.as_dict())
     for name in ("root", "num_workers", "test_shapes"):
         del plain["data"][name]
-    rows = make_datamodule(settings).clouds("train").rows
+    rows = arm.datamodule.clouds("train").rows
     plain["data"]["checksum"] = f"{zlib.crc32(np.ascontiguousarray(rows).data):08x}"
     return yaml.safe_dump(plain, sort_keys=False)
-
-
-def check(arm: str, settings: Settings) -> None:
-    """Build everything that settings can get wrong, before a run deletes or writes anything.
-
-    Raises:
-        CorrmatError: data that cannot be read, a network or Trainer that cannot be built.
-    """
-    make_module(arm, settings)
-    make_datamodule(settings).setup()
-    try:
-        L.Trainer(**trainer_options(settings), logger=False)
-    except (MisconfigurationException, ValueError, TypeError) as error:
-        first = str(error).splitlines()[0]
-        raise CorrmatError(f"no Trainer of these --trainer options: {first}") from error
 
 
 def _progress(checkpoint: Path, datamodule: RegistrationDataModule) -> dict[str, int]:
@@ -313,17 +351,17 @@ def _wandb(folder: Path, arm: str, group: str, mode: str, settings: Settings) ->
     return WandbLogger(experiment=run)
 
 
-def _reusable(recipe: Recipe, arm: str, settings: Settings, runs: Path) -> Trained | None:
+def _reusable(recipe: Recipe, arm: Arm, runs: Path) -> Trained | None:
     """The same arm, already trained to the end with the same settings.
 
     Either by the experiment that `networks_of` names, or by this one, if it was stopped
     before its record was written.
     """
     for identity in filter(None, (recipe.networks_of, recipe.id)):
-        folder = runs / recipe.scale / recipe.data / identity / arm
+        folder = runs / recipe.scale / recipe.data / identity / arm.name
         done, stored = folder / "trained.json", folder / "settings.yaml"
         recorded = identity == recipe.id and (folder / RECORDED).exists()
-        if done.is_file() and not recorded and stored.read_text() == training_settings(settings):
+        if done.is_file() and not recorded and stored.read_text() == training_settings(arm):
             say(f"trained already: {folder}")
             content = json.loads(done.read_text())
             return Trained(**content | {"checkpoint": folder / content["checkpoint"]})

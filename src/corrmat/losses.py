@@ -4,11 +4,18 @@ A method is a mixin in front of `RegistrationModule`: the paper's METHOD and MET
 differ in this one base class and in nothing else.
 """
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
+from corrmat.ops import rigid
 from corrmat.ops.correspondence import SoftCorrespondence
+from corrmat.ops.neighbors import nearest, take
 from corrmat.types import PairBatch, Prediction
+
+DISCOUNT = 0.5  # of a turn against the next
+INLIER_WEIGHT = 0.01
 
 
 def transformation_loss(
@@ -44,6 +51,50 @@ def correspondence_loss(c: SoftCorrespondence, match: Tensor) -> Tensor:
     return c.nll(match).sum() / c.is_class(match).sum().clamp_min(1)
 
 
+def registration_loss(prediction: Prediction, batch: PairBatch) -> Tensor:
+    """One turn of L_RPMNet: mean L1 distance of source points, and doubt (paper section 5.2).
+
+    Doubt is how much the rows and columns of the matrix lack to one, on average, times 0.01:
+    RPM-Net's L_inlier, which keeps it from calling every point unmatched.
+
+    Returns:
+        A scalar.
+    """
+    if prediction.correspondence is None:
+        raise ValueError("this network predicts no correspondence to be sure of")
+    source = batch.source[..., :3]
+    moved = rigid.apply(prediction.rotation, prediction.translation, source)
+    truth = rigid.apply(batch.rotation, batch.translation, source)
+    prob = prediction.correspondence.prob()
+    doubt = (1 - prob.sum(1)).mean() + (1 - prob.sum(2)).mean()
+    return (moved - truth).abs().mean() + INLIER_WEIGHT * doubt
+
+
+def chamfer_loss(moved: Tensor, target: Tensor) -> Tensor:
+    """CD: mean distance to the nearest point, there and back, not squared (paper section 5.3).
+
+    Exact, with memory linear in the number of points.
+
+    Args:
+        moved: (B, N, 3).
+        target: (B, M, 3).
+
+    Returns:
+        A scalar.
+    """
+    there = moved - take(target, nearest(moved, target))
+    back = target - take(moved, nearest(target, moved))
+    return there.norm(dim=-1).mean() + back.norm(dim=-1).mean()
+
+
+def discounted(losses: Sequence[Tensor]) -> Tensor:
+    """Sum over the turns of an iterative network, each worth half the next (RPM-Net)."""
+    total = losses[0]
+    for loss in losses[1:]:
+        total = DISCOUNT * total + loss
+    return total
+
+
 class TransformationLoss:
     """Train on the error of the transform: METHOD, for DCP."""
 
@@ -58,7 +109,27 @@ class CorrespondenceLoss:
     """Train on the correspondence matrix: METHOD_corr."""
 
     def loss(self, prediction: Prediction, batch: PairBatch) -> Tensor:
-        """`correspondence_loss` of a batch."""
-        if prediction.correspondence is None:
+        """`correspondence_loss` of a batch, `discounted` over the turns if there are several."""
+        found = [step.correspondence for step in prediction.steps]
+        if None in found:
             raise ValueError("this network predicts no correspondence to train on")
-        return correspondence_loss(prediction.correspondence, batch.match)
+        return discounted([correspondence_loss(c, batch.match) for c in found if c is not None])
+
+
+class RegistrationLoss:
+    """Train on distances of transformed points: METHOD, for RPMNet."""
+
+    def loss(self, prediction: Prediction, batch: PairBatch) -> Tensor:
+        """`registration_loss` of a batch, `discounted` over the turns."""
+        return discounted([registration_loss(step, batch) for step in prediction.steps])
+
+
+class ChamferLoss:
+    """Train on the distance of the two clouds: METHOD, for PCRNet. It needs no truth."""
+
+    def loss(self, prediction: Prediction, batch: PairBatch) -> Tensor:
+        """`chamfer_loss` of the source, moved as predicted, and the target."""
+        source, target = batch.source[..., :3], batch.target[..., :3]
+        return chamfer_loss(
+            rigid.apply(prediction.rotation, prediction.translation, source), target
+        )

@@ -1,27 +1,80 @@
 """The paper's methods: a loss, the one module, a network. No arguments: the paper's settings."""
 
-from corrmat.losses import CorrespondenceLoss, TransformationLoss
+from typing import ClassVar
+
+from torch import nn
+
+from corrmat.losses import (
+    ChamferLoss,
+    CorrespondenceLoss,
+    RegistrationLoss,
+    TransformationLoss,
+)
 from corrmat.module import OptimizerSettings, RegistrationModule
 from corrmat.networks.dcp import DCPNetwork
+from corrmat.networks.pcrnet import PCRNetCorrNetwork, PCRNetwork
+from corrmat.networks.rpmnet import RPMNetwork
 
 
-class _DCP(RegistrationModule):
-    """DCP's network, with DCP's optimizer."""
+class Method(RegistrationModule):
+    """A network and optimizer with the paper's settings, unless others are given."""
 
-    network_type = DCPNetwork
+    network_type: ClassVar[type[nn.Module]]
+    paper_optimizer: ClassVar[OptimizerSettings]
 
     def __init__(
-        self, network: DCPNetwork | None = None, optimizer: OptimizerSettings | None = None
+        self, network: nn.Module | None = None, optimizer: OptimizerSettings | None = None
     ) -> None:
-        super().__init__(network or DCPNetwork(), optimizer or OptimizerSettings())
+        super().__init__(network or self.network_type(), optimizer or self.paper_optimizer)
 
 
-class DCP(TransformationLoss, _DCP):
+class DCP(TransformationLoss, Method):
     """Deep Closest Point, trained on the error of the transform."""
 
+    network_type = DCPNetwork
+    paper_optimizer = OptimizerSettings()
 
-class DCPCorr(CorrespondenceLoss, _DCP):
+
+class DCPCorr(CorrespondenceLoss, Method):
     """Deep Closest Point, trained on the correspondence matrix."""
 
+    network_type = DCPNetwork
+    paper_optimizer = DCP.paper_optimizer
 
-METHODS: dict[str, type[_DCP]] = {"DCP": DCP, "DCP_corr": DCPCorr}
+
+class RPMNet(RegistrationLoss, Method):
+    """RPM-Net, trained on the distances of transformed points."""
+
+    network_type = RPMNetwork
+    paper_optimizer = OptimizerSettings(1e-4, 0.0, milestones=())
+
+
+class RPMNetCorr(CorrespondenceLoss, Method):
+    """RPM-Net, trained on the correspondence matrix of every turn; its rate falls to 1e-4."""
+
+    network_type = RPMNetwork
+    paper_optimizer = OptimizerSettings(1e-2, 0.0, milestones=(500, 750), gamma=0.1)
+
+
+class PCRNet(ChamferLoss, Method):
+    """PCRNet's pose network, trained on the Chamfer distance of the two clouds."""
+
+    network_type = PCRNetwork
+    paper_optimizer = OptimizerSettings(1e-3, 0.0, milestones=())
+
+
+class PCRNetCorr(CorrespondenceLoss, Method):
+    """PCRNet's point features, trained on the correspondence matrix."""
+
+    network_type = PCRNetCorrNetwork
+    paper_optimizer = OptimizerSettings(1e-3, 1e-4, milestones=(75, 150, 200), gamma=0.1)
+
+
+METHODS: dict[str, type[Method]] = {
+    "DCP": DCP,
+    "DCP_corr": DCPCorr,
+    "RPMNet": RPMNet,
+    "RPMNet_corr": RPMNetCorr,
+    "PCRNet": PCRNet,
+    "PCRNet_corr": PCRNetCorr,
+}

@@ -11,6 +11,7 @@ from torchmetrics import Metric
 from torchmetrics.utilities import dim_zero_cat
 
 from corrmat.ops import rigid
+from corrmat.ops.neighbors import nearest, take
 from corrmat.types import PairBatch, Prediction
 
 RECALL_DEG, RECALL_UNITS = 5.0, 0.05
@@ -68,6 +69,11 @@ def translation_error(translation_pred: Tensor, translation: Tensor) -> Tensor:
     return (translation_pred.double() - translation.double()).norm(dim=-1)
 
 
+def is_match(match: Tensor, num_target: int) -> Tensor:
+    """Which entries of match name one of num_target points: not -1 (none), not M (outlier)."""
+    return (match >= 0) & (match < num_target)
+
+
 def right_matches(predicted: Tensor, match: Tensor, num_target: int) -> Tensor:
     """How many rows have their arg max at the true match.
 
@@ -79,13 +85,32 @@ def right_matches(predicted: Tensor, match: Tensor, num_target: int) -> Tensor:
     Returns:
         (B,) int64.
     """
-    return ((predicted == match) & _has_match(match, num_target)).sum(1)
+    return ((predicted == match) & is_match(match, num_target)).sum(1)
 
 
 def match_accuracy(predicted: Tensor, match: Tensor, num_target: int) -> Tensor:
     """Share (B,) float64 of rows with a match whose arg max is it; see `right_matches`."""
-    rows = _has_match(match, num_target).sum(1)
+    rows = is_match(match, num_target).sum(1)
     return right_matches(predicted, match, num_target).double() / rows
+
+
+def transposed_right_matches(predicted: Tensor, match: Tensor) -> Tensor:
+    """The released PCRNet_corr count: the predicted matrix against the true one's transpose.
+
+    Row i counts where match[predicted[i]] = i, so a perfect prediction of a random permutation
+    scores about 2 / N. Report it only beside `right_matches`.
+
+    Args:
+        predicted: (B, N) int64.
+        match: (B, N) int64, of two clouds of N points each.
+
+    Returns:
+        (B,) int64.
+    """
+    n = match.shape[1]
+    there = match.gather(1, predicted.clamp(0, n - 1))
+    found = (there == torch.arange(n, device=match.device)) & (predicted < n)
+    return found.sum(1)
 
 
 def chamfer(prediction: Prediction, batch: PairBatch) -> Tensor:
@@ -112,33 +137,38 @@ class RegistrationMetrics(Metric):
     """
 
     full_state_update = False
-    shape: list[Tensor]
-    predicted: list[Tensor]
-    truth: list[Tensor]
-    right: list[Tensor]
-    rows: list[Tensor]
-    distance: list[Tensor]
+    _STATE = ("shape", "predicted", "truth", "right", "transposed", "rows", "distance")
 
     def __init__(self) -> None:
         super().__init__()
-        for name in ("shape", "predicted", "truth", "right", "rows", "distance"):
+        for name in self._STATE:
             self.add_state(name, default=[], dist_reduce_fx="cat")
 
-    def update(self, prediction: Prediction, batch: PairBatch, with_chamfer: bool = False) -> None:
-        """Add a batch; the Chamfer distance costs more than the rest and is optional."""
+    def update(self, prediction: Prediction, batch: PairBatch) -> None:
+        """Add a batch."""
+        n, m, c = batch.source.shape[1], batch.target.shape[1], prediction.correspondence
         none = torch.full((len(batch),), torch.nan, dtype=torch.float64, device=batch.source.device)
-        m = batch.target.shape[1]
-        c = prediction.correspondence
-        self.shape.append(batch.shape)
-        self.predicted.append(_row(prediction.rotation, prediction.translation))
-        self.truth.append(_row(batch.rotation, batch.translation))
-        self.right.append(none if c is None else right_matches(c.argmax(), batch.match, m).double())
-        self.rows.append(_has_match(batch.match, m).sum(1))
-        self.distance.append(chamfer(prediction, batch).double() if with_chamfer else none)
+        right, transposed = none, none
+        if c is not None:
+            predicted = c.argmax()
+            right = right_matches(predicted, batch.match, m).double()
+            if n == m and is_match(batch.match, m).all():
+                transposed = transposed_right_matches(predicted, batch.match).double()
+        values = {
+            "shape": batch.shape,
+            "predicted": _row(prediction.rotation, prediction.translation),
+            "truth": _row(batch.rotation, batch.translation),
+            "right": right,
+            "transposed": transposed,
+            "rows": is_match(batch.match, m).sum(1),
+            "distance": chamfer(prediction, batch).double(),
+        }
+        for name in self._STATE:
+            getattr(self, name).append(values[name])
 
     def per_pair(self) -> dict[str, Tensor]:
         """Every quantity of every pair, on the CPU: (B,), Euler angles (B, 3), motion (B, 12)."""
-        cat = {name: dim_zero_cat(getattr(self, name)).cpu() for name in self._defaults}
+        cat = {name: dim_zero_cat(getattr(self, name)).cpu() for name in self._STATE}
         (r, t), (true_r, true_t) = _motion(cat["predicted"]), _motion(cat["truth"])
         return {
             "shape": cat["shape"],
@@ -148,6 +178,7 @@ class RegistrationMetrics(Metric):
             "naive_euler_error_deg": naive_euler_error_deg(r, true_r),
             "translation_error": translation_error(t, true_t),
             "right": cat["right"],
+            "transposed": cat["transposed"],
             "rows": cat["rows"],
             "chamfer": cat["distance"],
         }
@@ -174,16 +205,13 @@ def summary(per_pair: dict[str, Tensor]) -> dict[str, float]:
         "naive_euler_rmse_deg": naive.square().mean().sqrt(),
         "translation_rmse": (shift.square().mean() / 3).sqrt(),
         "match_accuracy": per_pair["right"].sum() / per_pair["rows"].sum(),
+        "transposed_match_accuracy": per_pair["transposed"].sum() / per_pair["rows"].sum(),
         "chamfer": per_pair["chamfer"].mean(),
         "recall@5deg_0.05": hit.double().mean(),
         "failed": (~angle.isfinite()).double().sum(),
         "pairs": torch.tensor(float(len(angle))),
     }
     return {name: float(value) for name, value in values.items()}
-
-
-def _has_match(match: Tensor, num_target: int) -> Tensor:
-    return (match >= 0) & (match < num_target)
 
 
 def _row(rotation: Tensor, translation: Tensor) -> Tensor:
@@ -203,9 +231,6 @@ def _euler_deg(rotation: Tensor) -> Tensor:
     return torch.from_numpy(angles).to(rotation.device)
 
 
-@torch.no_grad()
 def _nearest_squared(points: Tensor, cloud: Tensor) -> Tensor:
-    distance = torch.cdist(
-        points.double(), cloud.double(), compute_mode="donot_use_mm_for_euclid_dist"
-    )
-    return distance.amin(-1).square()
+    found = take(cloud, nearest(points, cloud))
+    return (points.double() - found.double()).square().sum(-1)

@@ -73,8 +73,8 @@ class RegistrationModule(L.LightningModule):
         loss = self.loss(prediction, batch)
         if not torch.isfinite(loss):
             raise CorrmatError(
-                f"the loss is {loss.item()} at step {self.global_step} "
-                f"(epoch {self.current_epoch}, batch {batch_index}); "
+                f"the loss is {loss.item()} at step {self.global_step} (epoch "
+                f"{self.current_epoch}, batch {batch_index}, shapes {batch.shape.tolist()}); "
                 "lower --optimizer.lr or clip gradients"
             )
         self.log("train/loss", loss, prog_bar=True, batch_size=len(batch))
@@ -99,7 +99,7 @@ class RegistrationModule(L.LightningModule):
 
     def test_step(self, batch: PairBatch, batch_index: int) -> None:
         """Keep what was predicted; the caller reads `metrics` and resets it."""
-        self.metrics.update(self(batch.source, batch.target), batch, with_chamfer=True)
+        self.metrics.update(self(batch.source, batch.target), batch)
 
     def configure_optimizers(self) -> Any:  # noqa: ANN401 (Lightning's many forms)
         """Adam with the schedule of the settings."""

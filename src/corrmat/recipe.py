@@ -5,6 +5,7 @@ file, its scale, the arm's own lines, the command line. The sum is checked again
 of the classes that it configures, so a misspelt key is an error and nothing starts.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import lightning as L
 import yaml
 from jsonargparse import ArgumentParser, Namespace
 
+from corrmat.baselines import BASELINES, UNTRAINED
 from corrmat.data.datamodule import RegistrationDataModule
 from corrmat.errors import CorrmatError
 from corrmat.methods import METHODS
@@ -28,6 +30,7 @@ _TOP = {
     "scales",
     "bands_deg",
     "networks_of",
+    "baselines",
     "base",
     "seed",
     *GROUPS,
@@ -55,6 +58,7 @@ class Recipe:
     settings: dict[str, Namespace]  # arm -> seed, data, network, optimizer, trainer
     bands_deg: tuple[float, ...]  # edges of rotation bands to test on one by one; may be empty
     networks_of: str | None  # the experiment whose trained networks serve here too
+    baselines: tuple[str, ...]  # what else is tested: names of `baselines`
 
     @property
     def data(self) -> str:
@@ -89,10 +93,14 @@ def load(path: Path, scale: str, options: list[str], arms: list[str] | None = No
     chosen = merged["arms"] if arms is None else {a: merged["arms"].get(a) for a in arms}
     settings = {}
     for arm, own in chosen.items():
-        if arm not in METHODS or arm not in merged["arms"]:
+        if arm not in merged["arms"]:
             raise CorrmatError(f"{path}: unknown arm {arm!r}; known: {', '.join(merged['arms'])}")
+        own = dict(own or {})
+        method = own.pop("method", arm)
+        if method not in METHODS:
+            raise CorrmatError(f"{path}: unknown method {method!r}; known: {', '.join(METHODS)}")
         common = {key: merged[key] for key in ("seed", *GROUPS) if key in merged}
-        settings[arm] = _parse(arm, merge(common, own or {}), options, path)
+        settings[arm] = _parse(method, merge(common, own), options, path)
     return Recipe(
         id=str(merged["id"]),
         title=merged["title"],
@@ -101,15 +109,16 @@ def load(path: Path, scale: str, options: list[str], arms: list[str] | None = No
         settings=settings,
         bands_deg=tuple(merged.get("bands_deg", ())),
         networks_of=merged.get("networks_of"),
+        baselines=_known_baselines(merged.get("baselines", ()), path),
     )
 
 
-def parser(arm: str, prog: str = "corrmat") -> ArgumentParser:
-    """The typed settings of one arm as command-line options."""
+def parser(method: str, prog: str = "corrmat") -> ArgumentParser:
+    """The typed settings of one method as command-line options."""
     found = ArgumentParser(prog=prog, exit_on_error=False, add_help=False)
     found.add_argument("--seed", type=int, default=0, help="of weights, pairs and held-out shapes")
     found.add_class_arguments(RegistrationDataModule, "data", skip={"seed"})
-    found.add_class_arguments(METHODS[arm].network_type, "network")
+    found.add_class_arguments(METHODS[method].network_type, "network")
     found.add_class_arguments(OptimizerSettings, "optimizer")
     found.add_class_arguments(L.Trainer, "trainer", skip=_NOT_TRAINER, instantiate=False)
     return found
@@ -124,8 +133,8 @@ def merge(under: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
     return merged
 
 
-def _parse(arm: str, settings: dict[str, Any], options: list[str], path: Path) -> Namespace:
-    typed = parser(arm)
+def _parse(method: str, settings: dict[str, Any], options: list[str], path: Path) -> Namespace:
+    typed = parser(method)
     if any(option.startswith("--trainer.max_epochs") for option in options):
         # Whoever says how many epochs means it: the recipe's steps no longer count.
         settings = merge(settings, {"trainer": {"max_steps": -1}})
@@ -135,11 +144,20 @@ def _parse(arm: str, settings: dict[str, Any], options: list[str], path: Path) -
     except Exception as error:
         raise CorrmatError(f"{path}: {_first_line(error)}") from error
     try:
-        return typed.parse_args(options, namespace=under)
+        found = typed.parse_args(options, namespace=under)
     except Exception as error:
         raise CorrmatError(
             f"{_first_line(error)} (corrmat fit --help lists the options)"
         ) from error
+    return Namespace(method=method, **{name: found[name] for name in ("seed", *GROUPS)})
+
+
+def _known_baselines(names: Sequence[str], path: Path) -> tuple[str, ...]:
+    known = (*BASELINES, UNTRAINED)
+    for name in names:
+        if name not in known:
+            raise CorrmatError(f"{path}: unknown baseline {name!r}; known: {', '.join(known)}")
+    return tuple(names)
 
 
 def _first_line(error: Exception) -> str:

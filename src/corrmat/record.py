@@ -35,24 +35,33 @@ def scores(tests: list[dict[str, Tensor]], bands_deg: tuple[float, ...]) -> dict
     return found_all
 
 
-def rows(arm: str, band: int, found: dict[str, Tensor]) -> list[dict[str, Any]]:
-    """Lines of per_pair.csv: the predicted transform of each pair and what it scores."""
-    columns = found["transform"].tolist()
-    return [
-        {
-            "arm": arm,
-            "band": band,
-            "shape": int(found["shape"][i]),
-            "category": int(found["category"][i]),
-            "rotation_error_deg": f"{float(found['rotation_error_deg'][i]):.5g}",
-            "translation_error": f"{float(found['translation_error'][i]):.5g}",
-            "right": int(found["right"][i]) if found["right"][i].isfinite() else "",
-            "rows": int(found["rows"][i]),
-            "chamfer": f"{float(found['chamfer'][i]):.5g}",
-            "transform": " ".join(f"{value:.6g}" for value in columns[i]),
-        }
-        for i in range(len(columns))
-    ]
+def rows(arm: str, tests: list[dict[str, Tensor]]) -> list[dict[str, Any]]:
+    """Lines of per_pair.csv: the predicted transform of each pair and what it scores.
+
+    Args:
+        arm: name of the arm or baseline.
+        tests: per-pair values, one set a band.
+    """
+    return [_line(arm, band, found, i) for band, found in enumerate(tests) for i in _pairs(found)]
+
+
+def _pairs(found: dict[str, Tensor]) -> range:
+    return range(len(found["shape"]))
+
+
+def _line(arm: str, band: int, found: dict[str, Tensor], i: int) -> dict[str, Any]:
+    return {
+        "arm": arm,
+        "band": band,
+        "shape": int(found["shape"][i]),
+        "category": int(found["category"][i]),
+        "rotation_error_deg": f"{float(found['rotation_error_deg'][i]):.5g}",
+        "translation_error": f"{float(found['translation_error'][i]):.5g}",
+        "right": int(found["right"][i]) if found["right"][i].isfinite() else "",
+        "rows": int(found["rows"][i]),
+        "chamfer": f"{float(found['chamfer'][i]):.5g}",
+        "transform": " ".join(f"{value:.6g}" for value in found["transform"][i].tolist()),
+    }
 
 
 def write(

@@ -9,58 +9,60 @@ from typing import Any
 
 from corrmat.errors import CorrmatError
 
-# metric -> (heading, format, factor); the paper's metrics first, then the sound ones.
+# metric -> (heading, format, factor); the sound ones first, then the paper's (SPEC: 5).
 METRICS: dict[str, tuple[str, str, float]] = {
     "match_accuracy": ("correct matches, %", ".1f", 100),
-    "relative_euler_rmse_deg": ("rotation RMSE (Euler), deg", ".3g", 1),
-    "relative_euler_mae_deg": ("rotation MAE (Euler), deg", ".3g", 1),
-    "translation_rmse": ("translation RMSE", ".2g", 1),
     "rotation_error_deg_mean": ("rotation error, mean, deg", ".3g", 1),
     "rotation_error_deg_median": ("rotation error, median, deg", ".3g", 1),
+    "translation_rmse": ("translation RMSE", ".2g", 1),
     "recall@5deg_0.05": ("pairs under 5 deg and 0.05, %", ".1f", 100),
     "chamfer": ("Chamfer distance (squared)", ".2g", 1),
     "failed": ("pairs without an answer", ".0f", 1),
+    "relative_euler_rmse_deg": ("rotation RMSE (Euler), deg", ".3g", 1),
+    "relative_euler_mae_deg": ("rotation MAE (Euler), deg", ".3g", 1),
+    "naive_euler_rmse_deg": ("rotation RMSE (naive Euler), deg", ".3g", 1),
+    "transposed_match_accuracy": ("matches as released (transposed), %", ".1f", 100),
 }
+BAND_METRICS = ("relative_euler_mae_deg", "match_accuracy", "chamfer")
+# The columns of the paper's figures 5, 6 and 7: what a curve shows, by the arms' family.
 PANELS = {
-    "loss": "training loss",
-    "match_accuracy": "correct matches, %",
-    "relative_euler_rmse_deg": "rotation RMSE, deg",
-    "translation_rmse": "translation RMSE",
+    "DCP": ("loss", "match_accuracy", "relative_euler_rmse_deg", "translation_rmse"),
+    "RPMNet": ("loss", "match_accuracy", "rotation_error_deg_mean", "chamfer"),
+    "PCRNet": ("loss", "match_accuracy", "naive_euler_rmse_deg", "rotation_error_deg_mean"),
 }
-COLOURS = ("#d62728", "#1f77b4")  # METHOD red, METHOD_corr blue, as in the paper's figures
+COLOURS = ("#d62728", "#1f77b4", "#2ca02c", "#9467bd")  # METHOD red, METHOD_corr blue: the paper's
 README_METRICS = (
     "match_accuracy",
-    "relative_euler_rmse_deg",
+    "rotation_error_deg_mean",
     "rotation_error_deg_median",
-    "translation_rmse",
+    "relative_euler_rmse_deg",
+    "naive_euler_rmse_deg",
 )
 
 
 def table(record: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
     """Ours beside the paper's: headings and rows of text, one row a metric (and a band)."""
-    first, second = record["arms"]
-    heads = [
-        "",
-        f"{first}",
-        f"{second}",
-        "ratio",
-        f"paper {first}",
-        f"paper {second}",
-        "paper ratio",
-    ]
-    rows = []
-    for name, (label, style, factor) in METRICS.items():
-        ours = [_value(record["arms"][arm], name) for arm in (first, second)]
-        paper = [_value(record["paper"].get(arm, {}), name) for arm in (first, second)]
-        if any(value is not None for value in ours):
-            rows.append([label, *_cells(ours, style, factor), *_cells(paper, style, factor)])
+    arms, baselines, paper = record["arms"], record.get("baselines", {}), record["paper"]
+    heads = ["", *arms, "ratio", *baselines, *(f"paper {arm}" for arm in paper), "paper ratio"]
+
+    def cells(name: str, band: int | None) -> list[str] | None:
+        ours, others, theirs = (
+            [_value(_of_band(found, band), name) for found in group.values()]
+            for group in (arms, baselines, paper)
+        )
+        if all(value is None for value in ours):
+            return None
+        style, factor = METRICS[name][1:]
+        shown = [
+            [_cell(value, style, factor) for value in group] for group in (ours, others, theirs)
+        ]
+        return [*shown[0], _ratio(ours), *shown[1], *shown[2], _ratio(theirs)]
+
+    rows = [[METRICS[name][0], *found] for name in METRICS if (found := cells(name, None))]
     for index, (low, high) in enumerate(_bands(record)):
-        for name in ("relative_euler_mae_deg", "match_accuracy"):
-            label, style, factor = METRICS[name]
-            ours = [_value(record["arms"][arm]["bands"][index], name) for arm in (first, second)]
-            paper = [_value(_paper_band(record, arm, index), name) for arm in (first, second)]
-            cells = [*_cells(ours, style, factor), *_cells(paper, style, factor)]
-            rows.append([f"{low:g} to {high:g} deg: {label}", *cells])
+        for name in BAND_METRICS:
+            if found := cells(name, index):
+                rows.append([f"{low:g} to {high:g} deg: {METRICS[name][0]}", *found])
     return heads, rows
 
 
@@ -95,6 +97,9 @@ def markdown_summary(records: Sequence[Mapping[str, Any]]) -> str:
                 minutes = f"{found['train_seconds'] / 60:.1f}"
                 start = [f"{identity} {record['scale']}", record["data"], arm]
                 lines.append(_row([*start, *_readme_cells(found), minutes]))
+            for name, found in record.get("baselines", {}).items():
+                start = [f"{identity} {record['scale']}", record["data"], f"*{name}*"]
+                lines.append(_row([*start, *_readme_cells(found), ""]))
         for arm, found in same[0]["paper"].items():
             cells = _readme_cells(found)
             if any(cells):
@@ -143,32 +148,35 @@ def refresh(path: Path, name: str, content: str) -> None:
 
 
 def curves_figure(record: Mapping[str, Any], path: Path) -> None:
-    """The paper's four columns: loss, matches, rotation and translation error, both arms.
+    """The paper's columns (`PANELS`), all arms.
 
     Validation metrics against pairs seen; the paper's final values as dotted lines.
     """
     from matplotlib.figure import Figure  # only who draws waits for it
 
+    arms = record["arms"]
+    panels = PANELS[next(iter(arms)).split("_")[0]]
     figure = Figure(figsize=(15, 3.6), layout="constrained")
     figure.suptitle(f"{record['id']}  {record['title']}  ({record['scale']}, {record['data']})")
-    for axes, (name, title) in zip(figure.subplots(1, len(PANELS)), PANELS.items(), strict=True):
-        factor = METRICS.get(name, ("", "", 1))[2]
-        for arm, colour in zip(record["arms"], COLOURS, strict=False):
-            curve = record["arms"][arm]["curve"]
-            seen = [point["pairs_seen"] for point in curve]
-            axes.plot(
-                seen, [factor * point[name] for point in curve], color=colour, marker=".", label=arm
-            )
+    for axes, name in zip(figure.subplots(1, len(panels)), panels, strict=True):
+        title, _, factor = METRICS.get(name, ("training loss", "", 1))
+        for arm, colour in zip(arms, COLOURS, strict=False):
+            curve = arms[arm]["curve"]
+            values = [_value(point, name) for point in curve]
+            if None not in values:
+                seen = [point["pairs_seen"] for point in curve]
+                shown = [factor * value for value in values if value is not None]
+                axes.plot(seen, shown, color=colour, marker=".", label=arm)
             final = _value(record["paper"].get(arm, {}), name)
             if final is not None:
                 axes.axhline(
                     factor * final, color=colour, linestyle=":", linewidth=1, label=f"paper, {arm}"
                 )
-        if name in ("relative_euler_rmse_deg", "translation_rmse"):
+        if name not in ("loss", "match_accuracy"):
             axes.set_yscale("log")
         axes.set(title=title, xlabel="training pairs seen")
         axes.grid(alpha=0.3)
-    figure.axes[1].legend(fontsize="small")
+        axes.legend(fontsize="x-small")
     figure.savefig(path, dpi=110, metadata={"Software": None})
 
 
@@ -181,10 +189,11 @@ def plain(value: Any) -> Any:  # noqa: ANN401
     return value if isinstance(value, str | int | float | bool | None) else str(value)
 
 
-def _cells(pair: Sequence[float | None], style: str, factor: float) -> list[str]:
-    first, second = pair
-    ratio = "" if first is None or not second else f"{first / second:.3g}"
-    return [_cell(first, style, factor), _cell(second, style, factor), ratio]
+def _ratio(values: Sequence[float | None]) -> str:
+    """Of METHOD to METHOD_corr, the first two."""
+    if len(values) < 2 or values[0] is None or not values[1]:
+        return ""
+    return f"{values[0] / values[1]:.3g}"
 
 
 def _cell(value: float | None, style: str, factor: float) -> str:
@@ -201,9 +210,11 @@ def _bands(record: Mapping[str, Any]) -> list[tuple[float, float]]:
     return list(zip(edges, edges[1:], strict=False))
 
 
-def _paper_band(record: Mapping[str, Any], arm: str, index: int) -> Mapping[str, Any]:
-    bands = record["paper"].get(arm, {}).get("bands", [])
-    return bands[index] if index < len(bands) else {}
+def _of_band(found: Mapping[str, Any], band: int | None) -> Mapping[str, Any]:
+    if band is None:
+        return found
+    bands = found.get("bands", [])
+    return bands[band] if band < len(bands) else {}
 
 
 def _pairs(record: Mapping[str, Any]) -> float:

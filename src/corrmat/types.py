@@ -47,3 +47,9 @@ class Prediction:
     def steps(self) -> "list[Prediction]":
         """One prediction an iteration, this one last."""
         return [*self.earlier, self]
+
+
+def with_earlier(steps: list[Prediction]) -> Prediction:
+    """The last of an iterative network's predictions, which knows those before it."""
+    *earlier, last = steps
+    return replace(last, earlier=tuple(earlier))

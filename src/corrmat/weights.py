@@ -1,7 +1,7 @@
 """Checkpoints of the original authors, under the names that this project gives their layers."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -9,37 +9,61 @@ from torch import Tensor, nn
 
 from corrmat.errors import CorrmatError
 from corrmat.networks.dcp import DCPNetwork
+from corrmat.networks.pcrnet import PCRNetCorrNetwork, PCRNetwork
+from corrmat.networks.rpmnet import RPMNetwork
 
-# Rewritten in this order; the first group of rules is DGCNN's, the second the transformer's.
-_DCP_RULES: tuple[tuple[str, str], ...] = (
-    (r"^emb_nn\.conv5\.", "embed.fuse."),
-    (r"^emb_nn\.bn5\.", "embed.norm."),
-    (r"^emb_nn\.conv(\d)\.", r"embed.edge.#\1.linear."),
-    (r"^emb_nn\.bn(\d)\.", r"embed.edge.#\1.norm."),
-    (r"^pointer\.model\.(en|de)coder\.norm\.", r"pointer.\1coder_norm."),
-    (r"^pointer\.model\.(en|de)coder\.layers\.0\.", r"pointer.\1coder."),
-    (r"self_attn\.", "self_attention."),
-    (r"src_attn\.", "cross_attention."),
-    (r"linears\.0\.", "query."),
-    (r"linears\.1\.", "key."),
-    (r"linears\.2\.", "value."),
-    (r"linears\.3\.", "out."),
-    (r"feed_forward\.w_1\.", "feedforward.0."),
-    (r"feed_forward\.w_2\.", "feedforward.2."),
-    (r"sublayer\.(\d)\.norm\.", r"norms.\1."),
-    (r"a_2$", "gain"),
-    (r"b_2$", "bias"),
-)
-_DCP_LEFT_OUT = ("head.reflect",)  # a constant of the original's SVD head
+State = dict[str, Tensor]
+
+# Their names to ours, rewritten in this order.
+_RULES: dict[str, tuple[tuple[str, str], ...]] = {
+    "dcp": (
+        (r"^emb_nn\.conv5\.", "embed.fuse."),
+        (r"^emb_nn\.bn5\.", "embed.norm."),
+        *((rf"^emb_nn\.conv{i + 1}\.", f"embed.edge.{i}.linear.") for i in range(4)),
+        *((rf"^emb_nn\.bn{i + 1}\.", f"embed.edge.{i}.norm.") for i in range(4)),
+        (r"^pointer\.model\.(en|de)coder\.norm\.", r"pointer.\1coder_norm."),
+        (r"^pointer\.model\.(en|de)coder\.layers\.0\.", r"pointer.\1coder."),
+        (r"self_attn\.", "self_attention."),
+        (r"src_attn\.", "cross_attention."),
+        (r"linears\.0\.", "query."),
+        (r"linears\.1\.", "key."),
+        (r"linears\.2\.", "value."),
+        (r"linears\.3\.", "out."),
+        (r"feed_forward\.w_1\.", "feedforward.0."),
+        (r"feed_forward\.w_2\.", "feedforward.2."),
+        (r"sublayer\.(\d)\.norm\.", r"norms.\1."),
+        (r"a_2$", "gain"),
+        (r"b_2$", "bias"),
+    ),
+    "rpmnet": (
+        (r"^feat_extractor\.prepool\.", "embed.edge."),
+        (r"^feat_extractor\.postpool\.6\.", "embed.out."),
+        (r"^feat_extractor\.postpool\.", "embed.point."),
+        (r"^weights_net\.prepool\.", "annealing.point."),
+        (r"^weights_net\.postpool\.", "annealing.pooled."),
+    ),
+    # PointNet's five layers: linear and ReLU, or linear, batch norm and ReLU.
+    "pcrnet": (
+        *((rf"^feature_model\.conv{i + 1}\.", f"embed.layers.{2 * i}.") for i in range(5)),
+        (r"^linear\.", "pose."),
+    ),
+    "pcrnet_corr": (
+        *((rf"^emb_nn\.conv{i + 1}\.", f"embed.layers.{3 * i}.") for i in range(5)),
+        *((rf"^emb_nn\.bn{i + 1}\.", f"embed.layers.{3 * i + 1}.") for i in range(5)),
+    ),
+}
+_LEFT_OUT = ("head.reflect",)  # a constant of the originals' SVD head
 
 
 def load_reference(kind: str, state_dict: Mapping[str, Any], **hparams: Any) -> nn.Module:  # noqa: ANN401
     """Build a network from the original authors' parameters.
 
     Args:
-        kind: "dcp".
+        kind: "dcp", "rpmnet", "pcrnet" or "pcrnet_corr".
         state_dict: their names to tensors or arrays.
-        hparams: the original's hyper-parameters: emb_dims, n_heads, ff_dims, k, pointer.
+        hparams: the original's hyper-parameters. dcp: emb_dims, n_heads, ff_dims, k, pointer.
+            rpmnet: feat_dim, num_neighbors, radius, num_iter, num_sk_iter, slack.
+            pcrnet: emb_dims, iterations. pcrnet_corr: emb_dims.
             Sizes default to what the tensors say; `notes` and the like are ignored.
 
     Returns:
@@ -48,55 +72,93 @@ def load_reference(kind: str, state_dict: Mapping[str, Any], **hparams: Any) -> 
     Raises:
         CorrmatError: unknown kind, or the parameters do not fit; the message lists them.
     """
-    if kind != "dcp":
-        raise CorrmatError(f"no reference network of kind {kind!r}; known: dcp")
-    return _load_dcp(state_dict, hparams)
-
-
-def rename_dcp(name: str) -> str:
-    """The name in `DCPNetwork` of one of the original DCP's parameters."""
-    for pattern, replacement in _DCP_RULES:
-        name = re.sub(pattern, replacement, name)
-    return re.sub(r"#(\d)", lambda found: str(int(found[1]) - 1), name)
-
-
-def _load_dcp(state_dict: Mapping[str, Any], hparams: dict[str, Any]) -> nn.Module:
+    if kind not in _BUILD:
+        raise CorrmatError(f"no reference network of kind {kind!r}; known: {', '.join(_BUILD)}")
     ours = {
-        rename_dcp(name): _squeezed(value)
+        rename(kind, name): torch.as_tensor(value)
         for name, value in state_dict.items()
-        if name not in _DCP_LEFT_OUT
+        if name not in _LEFT_OUT
     }
-    fuse = ours.get("embed.fuse.weight")
-    if fuse is None:
-        raise CorrmatError("not a DCP checkpoint: emb_nn.conv5.weight is missing")
-    hidden = ours.get("pointer.encoder.feedforward.0.weight")
-    network = DCPNetwork(
+    return _filled(_BUILD[kind](ours, hparams), ours)
+
+
+def rename(kind: str, name: str) -> str:
+    """What one of the original's parameters is called here."""
+    for pattern, replacement in _RULES[kind]:
+        name = re.sub(pattern, replacement, name)
+    return name
+
+
+def _dcp(state: State, hparams: dict[str, Any]) -> nn.Module:
+    fuse = _known(state, "embed.fuse.weight", "a DCP", "emb_nn.conv5.weight")
+    hidden = state.get("pointer.encoder.feedforward.0.weight")
+    return DCPNetwork(
         width=hparams.get("emb_dims", len(fuse)),
         pointer=hparams.get("pointer", "identity" if hidden is None else "transformer"),
         heads=hparams.get("n_heads", 4),
         feedforward=hparams.get("ff_dims", 1024 if hidden is None else len(hidden)),
         k=hparams.get("k", 20),
     )
-    return _filled(network, ours)
 
 
-def _filled(network: nn.Module, state: dict[str, Tensor]) -> nn.Module:
+def _rpmnet(state: State, hparams: dict[str, Any]) -> nn.Module:
+    out = _known(state, "embed.out.weight", "an RPMNet", "feat_extractor.postpool.6.weight")
+    turns = hparams.get("num_iter")
+    slack = str(hparams.get("slack", "both")).split()[0]  # RPM-Net's own; a remark may follow
+    return RPMNetwork(
+        width=hparams.get("feat_dim", len(out)),
+        k=hparams.get("num_neighbors", 64),
+        radius=hparams.get("radius", 0.3),
+        iterations=turns or 2,
+        test_iterations=turns or 5,
+        sinkhorn_iterations=hparams.get("num_sk_iter", 5),
+        slack=slack,  # type: ignore[arg-type]
+    )
+
+
+def _pcrnet(state: State, hparams: dict[str, Any]) -> nn.Module:
+    last = _known(state, "embed.layers.8.weight", "a PCRNet", "feature_model.conv5.weight")
+    return PCRNetwork(hparams.get("emb_dims", len(last)), hparams.get("iterations", 8))
+
+
+def _pcrnet_corr(state: State, hparams: dict[str, Any]) -> nn.Module:
+    last = _known(state, "embed.layers.12.weight", "a PCRNet_corr", "emb_nn.conv5.weight")
+    return PCRNetCorrNetwork(hparams.get("emb_dims", len(last)))
+
+
+_BUILD: dict[str, Callable[[State, dict[str, Any]], nn.Module]] = {
+    "dcp": _dcp,
+    "rpmnet": _rpmnet,
+    "pcrnet": _pcrnet,
+    "pcrnet_corr": _pcrnet_corr,
+}
+
+
+def _known(state: State, name: str, what: str, theirs: str) -> Tensor:
+    if name not in state:
+        raise CorrmatError(f"not {what} checkpoint: {theirs} is missing")
+    return state[name]
+
+
+def _filled(network: nn.Module, state: State) -> nn.Module:
     expected = network.state_dict()
     wrong = [f"{name} is missing" for name in expected if name not in state]
     wrong += [f"{name} is unknown" for name in state if name not in expected]
     wrong += [
-        f"{name} is {tuple(state[name].shape)}, not {tuple(tensor.shape)}"
+        f"{name} is {_shape(state[name])}, not {_shape(tensor)}"
         for name, tensor in expected.items()
-        if name in state and state[name].shape != tensor.shape
+        if name in state and _shape(state[name]) != _shape(tensor)
     ]
     if wrong:
         shown = "; ".join(wrong[:8]) + (f"; and {len(wrong) - 8} more" if len(wrong) > 8 else "")
         raise CorrmatError(f"the checkpoint does not fit: {shown}")
-    network.load_state_dict(state)
+    network.load_state_dict({name: state[name].view_as(own) for name, own in expected.items()})
     return network.eval()
 
 
-def _squeezed(value: Any) -> Tensor:  # noqa: ANN401
-    """1 x 1 convolutions are linear layers here."""
-    tensor = torch.as_tensor(value)
-    return tensor.flatten(1) if tensor.ndim > 2 else tensor
+def _shape(tensor: Tensor) -> tuple[int, ...]:
+    """Without the ones at the end, by which a 1 x 1 convolution differs from a linear layer."""
+    shape = list(tensor.shape)
+    while shape and shape[-1] == 1:
+        shape.pop()
+    return tuple(shape)

@@ -1,7 +1,10 @@
-"""Which points are near: k nearest neighbours."""
+"""Which points are near: k nearest, within a radius, the nearest of another cloud."""
 
 import torch
 from torch import Tensor
+
+_EXACT = "donot_use_mm_for_euclid_dist"
+_CHUNK = 2**24  # entries of a distance matrix that exist at once
 
 
 @torch.no_grad()
@@ -21,3 +24,47 @@ def knn(points: Tensor, k: int) -> Tensor:
     if points.shape[1] < k:
         raise ValueError(f"{k} neighbours asked of a cloud with {points.shape[1]} points")
     return torch.cdist(points.float(), points.float()).topk(k, largest=False).indices
+
+
+@torch.no_grad()
+def within_radius(points: Tensor, radius: float, k: int) -> Tensor:
+    """The k points of LOWEST INDEX within a radius, the point itself left out (RPM-Net).
+
+    Lowest index, not nearest: which neighbours a point gets depends on the order of its
+    cloud, so that two shuffled copies of a cloud have different neighbourhoods.
+
+    Args:
+        points: (B, N, 3).
+        radius: in units of the points; the border counts as inside.
+        k: how many.
+
+    Returns:
+        (B, N, k) int64, ascending; places left over hold the point's own index.
+    """
+    batch, n, _ = points.shape
+    own = torch.arange(n, device=points.device)
+    found = own.view(1, n, 1).repeat(batch, 1, k)
+    for part in own.split(max(1, _CHUNK // max(1, batch * n))):
+        near = torch.cdist(points[:, part], points, compute_mode=_EXACT) <= radius
+        near[:, torch.arange(len(part)), part] = False
+        rank = near.cumsum(-1, dtype=torch.int32)
+        b, i, j = (near & (rank <= k)).nonzero(as_tuple=True)
+        found[b, part[i], rank[b, i, j].long() - 1] = j
+    return found
+
+
+@torch.no_grad()
+def nearest(points: Tensor, cloud: Tensor) -> Tensor:
+    """Index (B, N) int64 of the nearest point of `cloud` (B, M, 3) to each of `points` (B, N, 3).
+
+    Exact, and no more than a slice of the distance matrix exists at a time.
+    """
+    rows = max(1, _CHUNK // max(1, cloud.shape[0] * cloud.shape[1]))
+    parts = points.split(rows, 1)
+    return torch.cat([torch.cdist(x, cloud, compute_mode=_EXACT).argmin(-1) for x in parts], 1)
+
+
+def take(values: Tensor, index: Tensor) -> Tensor:
+    """Rows of values (B, M, C) at index (B, ...): (B, ..., C)."""
+    flat = index.flatten(1).unsqueeze(-1).expand(-1, -1, values.shape[-1])
+    return values.gather(1, flat).unflatten(1, index.shape[1:])

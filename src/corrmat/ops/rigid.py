@@ -22,6 +22,12 @@ def apply(rotation: Tensor, translation: Tensor, points: Tensor) -> Tensor:
         return points @ rotation.mT + translation.unsqueeze(-2)
 
 
+def identity(points: Tensor) -> tuple[Tensor, Tensor]:
+    """The motions that leave points (B, N, 3) where they are: (B, 3, 3) and (B, 3)."""
+    eye = torch.eye(3, dtype=points.dtype, device=points.device)
+    return eye.expand(len(points), 3, 3), points.new_zeros(len(points), 3)
+
+
 def compose(outer: tuple[Tensor, Tensor], inner: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     """The motion that applies `inner` first and `outer` second; each is ((..., 3, 3), (..., 3))."""
     rotation, translation = outer

@@ -1,0 +1,115 @@
+"""RPM-Net (Yew & Lee, CVPR 2020), the network of experiments 2.1 to 2.4."""
+
+from functools import partial
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from corrmat.networks.pointnet import shared_mlp
+from corrmat.networks.ppf import Neighborhoods, neighborhoods
+from corrmat.ops import rigid
+from corrmat.ops.correspondence import SinkhornCorrespondence
+from corrmat.ops.rigid import procrustes
+from corrmat.ops.sinkhorn import Slack
+from corrmat.types import Prediction, with_earlier
+
+
+class RPMNetwork(nn.Module):
+    """Features of neighbourhoods, annealed affinities, Sinkhorn, weighted Procrustes; again.
+
+    Every turn moves the source by the transform so far (without its gradient) and looks
+    again. The target never moves, so its features are computed once; neighbours and pair
+    features of either cloud never change.
+
+    Args:
+        width: feature dimension d, a multiple of 8.
+        k: neighbours of each point.
+        radius: within which they lie, in units of the clouds.
+        iterations: turns in training.
+        test_iterations: turns in evaluation.
+        sinkhorn_iterations: normalisations of rows and columns a turn.
+        slack: see `sinkhorn`.
+        annealing_width: of the annealing net's pooled feature.
+    """
+
+    min_points = 3
+
+    def __init__(
+        self,
+        width: int = 96,
+        k: int = 64,
+        radius: float = 0.3,
+        iterations: int = 2,
+        test_iterations: int = 5,
+        sinkhorn_iterations: int = 5,
+        slack: Slack = "row",
+        annealing_width: int = 1024,
+    ) -> None:
+        super().__init__()
+        if width < 8 or width % 8:
+            raise ValueError(f"width {width} is not a multiple of 8, the groups of its norms")
+        self.k, self.radius = k, radius
+        self.iterations, self.test_iterations = iterations, test_iterations
+        self.sinkhorn_iterations = sinkhorn_iterations
+        self.slack: Slack = slack
+        self.embed = NeighborhoodNet(width)
+        self.annealing = AnnealingNet(annealing_width)
+
+    def forward(self, source: Tensor, target: Tensor) -> Prediction:
+        """Register source (B, N, 6) to target (B, M, 6): xyz and unit normals."""
+        if min(source.shape[-1], target.shape[-1]) < 6:
+            raise ValueError("RPMNet needs normals: clouds of 6 columns, xyz and unit normal")
+        x, y = source[..., :3], target[..., :3]
+        around_x = neighborhoods(source, self.radius, self.k)
+        f_y = self.embed(neighborhoods(target, self.radius, self.k))
+        rotation, translation = rigid.identity(x)
+        steps: list[Prediction] = []
+        for _ in range(self.iterations if self.training else self.test_iterations):
+            so_far = rotation.detach(), translation.detach()
+            f_x = self.embed(around_x.moved(*so_far))
+            beta, alpha = self.annealing(rigid.apply(*so_far, x), y)
+            c = SinkhornCorrespondence(f_x, f_y, beta, alpha, self.sinkhorn_iterations, self.slack)
+            rotation, translation = procrustes(x, c.soft_target(y), c.weight())
+            steps.append(Prediction(rotation, translation, c))
+        return with_earlier(steps)
+
+
+class NeighborhoodNet(nn.Module):
+    """Unit features of points from their neighbourhoods: a shared MLP, maximum, another MLP."""
+
+    def __init__(self, width: int = 96) -> None:
+        super().__init__()
+        norm = partial(nn.GroupNorm, 8)
+        self.edge = shared_mlp((10, width, width, 2 * width), norm)
+        self.point = shared_mlp((2 * width, 2 * width, width), norm)
+        self.out = nn.Conv1d(width, width, 1)
+
+    def forward(self, around: Neighborhoods) -> Tensor:
+        """Features (B, N, d) of length one."""
+        edges = around.features()
+        top = self.edge(edges.flatten(2)).unflatten(2, edges.shape[2:]).amax(3)
+        return F.normalize(self.out(self.point(top)).mT, dim=-1)
+
+
+class AnnealingNet(nn.Module):
+    """Reads off both clouds how sharp the matching can be: beta and alpha, positive."""
+
+    def __init__(self, width: int = 1024) -> None:
+        super().__init__()
+        self.point = nn.Sequential(
+            *shared_mlp((4, 64, 64, 64, 128), partial(nn.GroupNorm, 8)),
+            *shared_mlp((128, width), partial(nn.GroupNorm, 16)),
+        )
+        self.pooled = nn.Sequential(
+            nn.Linear(width, 512), nn.GroupNorm(16, 512), nn.ReLU(),
+            nn.Linear(512, 256), nn.GroupNorm(16, 256), nn.ReLU(),
+            nn.Linear(256, 2),
+        )  # fmt: skip
+
+    def forward(self, source: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+        """Clouds (B, N, 3) and (B, M, 3) in one frame -> beta (B,), alpha (B,)."""
+        flagged = torch.cat([F.pad(source, (0, 1), value=0.0), F.pad(target, (0, 1), value=1.0)], 1)
+        pooled = self.pooled(self.point(flagged.mT).amax(2))
+        beta, alpha = F.softplus(pooled).unbind(1)
+        return beta, alpha
