@@ -11,7 +11,7 @@ BIN := .venv/bin
 EXPERIMENTS := exp1.1 exp1.2 exp1.3 exp1.4 exp2.1 exp2.2 exp2.3 exp2.4 exp3.1 exp3.2 exp3.3
 RUN_OPTIONS = --scale $(SCALE) --data.data $(DATA) $(if $(ROOT),--data.root "$(ROOT)") $(ARGS)
 
-.PHONY: help $(EXPERIMENTS) all smoke docs bench lint format test test-slow lock clean
+.PHONY: help $(EXPERIMENTS) outliers robustness all smoke docs bench lint format test test-slow lock clean
 
 help:  ## list the targets
 	@echo "make TARGET [SCALE=smoke|laptop|paper] [DATA=shapes|modelnet40] [ROOT=folder] [ARGS='--key value']"
@@ -20,7 +20,13 @@ help:  ## list the targets
 $(EXPERIMENTS): exp%: .venv/ready  ## train both arms of an experiment, print ours beside the paper's
 	$(BIN)/python reproduce/exp$(subst .,_,$*).py $(RUN_OPTIONS)
 
-all: $(EXPERIMENTS)  ## every experiment
+outliers: .venv/ready  ## DCP with outliers, three ways to their class (supplement B)
+	$(BIN)/python reproduce/outliers.py $(RUN_OPTIONS)
+
+robustness: .venv/ready  ## figure 2: wrong matches against a wrong rotation vector, in seconds
+	$(BIN)/python reproduce/robustness.py --scale $(SCALE)
+
+all: robustness $(EXPERIMENTS) outliers  ## every experiment, figure 2 first
 
 docs: .venv/ready  ## rewrite the tables of README.md and the pictures of docs/ from results/
 	$(BIN)/corrmat report

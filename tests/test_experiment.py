@@ -45,6 +45,7 @@ def test_smoke_run_leaves_a_whole_record(identity, tmp_path, capsys):
         "config.yaml",
         "per_pair.csv",
         "curves.png",
+        "matches.png",
     }
     record = json.loads((folder / "metrics.json").read_text())
     assert list(record["arms"]) == list(found.settings)
@@ -54,13 +55,15 @@ def test_smoke_run_leaves_a_whole_record(identity, tmp_path, capsys):
         assert arm["pairs_seen"] == 32
         assert [point["pairs_seen"] for point in arm["curve"]] == [16, 32]
         assert len(arm.get("bands", [])) == (bands if bands > 1 else 0)
+        assert [part["outliers"] for part in arm.get("sweep", [])] == list(found.sweep_outliers)
         assert 0 < arm["rotation_error_deg_mean"] < 180
     rows = list(csv.DictReader((folder / "per_pair.csv").open()))
     tested = [*found.settings, *found.baselines]
     assert len(rows) == len(tested) * 8 * bands
     assert list(dict.fromkeys(row["arm"] for row in rows)) == tested
     assert list(record["baselines"]) == list(found.baselines)
-    assert (folder / "curves.png").read_bytes().startswith(b"\x89PNG")
+    for picture in ("curves.png", "matches.png"):
+        assert (folder / picture).read_bytes().startswith(b"\x89PNG")
     assert "correct matches, %" in capsys.readouterr().out
     assert not list((tmp_path / "results").rglob("*.partial"))
 
@@ -249,12 +252,13 @@ def test_wandb_writes_offline_and_touches_no_network(tmp_path, monkeypatch):
 def test_checkpoints_reload_to_the_same_network(tmp_path):
     settings = load("1.1").settings["DCP_corr"]
     trained = train("DCP_corr", settings, tmp_path / "run")
+    arm = experiment.prepare("DCP_corr", settings)
     first, again = (
-        experiment.evaluate(experiment.prepare("DCP_corr", settings), trained.checkpoint)
+        experiment.score(experiment.trained_module(arm, trained.checkpoint), arm)[0]
         for _ in range(2)
     )
-    assert torch.equal(first[0]["transform"], again[0]["transform"])
-    assert math.isfinite(float(first[0]["rotation_error_deg"].mean()))
+    assert torch.equal(first["transform"], again["transform"])
+    assert math.isfinite(float(first["rotation_error_deg"].mean()))
 
 
 def test_a_record_is_json_that_everybody_can_read(tmp_path, monkeypatch):

@@ -2,8 +2,9 @@ import h5py
 import numpy as np
 import pytest
 from conftest import shared
+from scipy.spatial.transform import Rotation
 
-from corrmat.data import modelnet40
+from corrmat.data import modelnet40, normals
 from corrmat.data.datamodule import RegistrationDataModule
 from corrmat.errors import CorrmatError
 
@@ -77,8 +78,8 @@ def damage(root, kind):
                 opened["data"][3, 7, 1] = np.nan
             elif kind == "label":
                 opened["label"][2] = 9
-            elif kind == "no normals":
-                del opened["normal"]
+            elif kind == "no points":
+                del opened["data"]
     return root
 
 
@@ -92,13 +93,39 @@ def damage(root, kind):
         ("no list", r"train_files\.txt is missing"),
         ("nan", r"ply_data_train1\.h5: shape 3 has NaN or infinite points"),
         ("label", r"ply_data_train1\.h5: labels do not fit"),
-        ("no normals", r"ply_data_train1\.h5 lacks an array"),
+        ("no points", r"ply_data_train1\.h5 lacks an array"),
     ],
 )
 def test_damage_is_named_in_one_line(root, kind, message):
     with pytest.raises(CorrmatError, match=message) as caught:
         module(damage(root, kind)).train_dataloader()
     assert "\n" not in str(caught.value)
+
+
+def test_clouds_without_normals_get_estimated_ones_and_it_is_said(root, caplog):
+    with h5py.File(root / modelnet40.FOLDER / "ply_data_train1.h5", "r+") as opened:
+        del opened["normal"]
+    clouds = modelnet40.load(root, "train")
+    assert "ply_data_train1.h5 has no normals: estimated" in caplog.text
+    np.testing.assert_allclose(np.linalg.norm(clouds.normals, axis=-1), 1, atol=1e-4)
+
+
+def test_estimated_normals_are_right_outward_and_turn_with_the_cloud():
+    rng = np.random.default_rng(0)
+    sphere = rng.standard_normal((1000, 3))
+    sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
+    found = normals.estimate(5 + 0.1 * sphere)
+    assert (found * sphere).sum(1).min() > 0.95
+    turn = Rotation.from_rotvec([0.3, -1.0, 2.0]).as_matrix()
+    np.testing.assert_allclose(normals.estimate(sphere @ turn.T), found @ turn.T, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    "cloud", [np.zeros((6, 3)), np.eye(3)[:1], np.outer(np.arange(9), [1, 2, 3])]
+)
+def test_estimated_normals_of_degenerate_clouds_are_units(cloud):
+    found = normals.estimate(cloud.astype(np.float32))
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-5)
 
 
 def test_what_does_not_fit_the_data_is_named(root):

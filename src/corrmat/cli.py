@@ -1,4 +1,4 @@
-"""The command line: corrmat run | fit | evaluate | data | report."""
+"""The command line: corrmat run | fit | evaluate | robustness | data | report."""
 
 import argparse
 import sys
@@ -15,6 +15,8 @@ EPILOG = """examples:
       one arm, with any setting changed
   corrmat evaluate --config configs/exp/1.1.yaml --arm DCP_corr
       the best checkpoint of the last run (or --checkpoint FILE) on the frozen test pairs
+  corrmat robustness
+      figure 2 of the paper: curve and picture in results/laptop/robustness
   corrmat data --sheet shapes.png
       make the embedded data set, draw its families
 
@@ -64,6 +66,13 @@ def _command(words: list[str]) -> int:
             name, help=purpose, description=purpose, add_help=False, allow_abbrev=False
         )
         _experiment_options(command, name)
+    figure = commands.add_parser(
+        "robustness", help="figure 2: wrong matches against a wrong rotation vector"
+    )
+    figure.add_argument("--scale", default="laptop", choices=["smoke", "laptop", "paper"],
+        help="smoke: 20 draws a point of a curve instead of 400")  # fmt: skip
+    figure.add_argument("--results", type=Path, default=Path("results"), help="folder of records")
+    figure.add_argument("--seed", type=int, default=0, help="of the draws")
     data = commands.add_parser("data", help="make the embedded data set, draw its families")
     data.add_argument("--sheet", type=Path, metavar="PNG", help="draw one shape of every family")
     report = commands.add_parser("report", help="rewrite the tables of the documents from results/")
@@ -73,6 +82,9 @@ def _command(words: list[str]) -> int:
     if known.command == "data":
         _refuse(options)
         return _data(known.sheet)
+    if known.command == "robustness":
+        _refuse(options)
+        return _robustness(known.scale, known.results, known.seed)
     if known.command == "report":
         _refuse(options)
         return _report(known.results, known.docs)
@@ -134,7 +146,8 @@ def _experiment(known: argparse.Namespace, options: list[str]) -> int:
         print(f"best checkpoint: {trained.checkpoint}")
         return 0
     checkpoint = known.checkpoint or experiment.best_checkpoint(found, name, known.runs)
-    tests = experiment.evaluate(arm, checkpoint, found.bands_deg)
+    module = experiment.trained_module(arm, checkpoint)
+    tests = experiment.score(module, arm, experiment.bands(found.bands_deg))
     for number, pairs in enumerate(tests):
         if found.bands_deg:
             print(f"\n{found.bands_deg[number]:g} to {found.bands_deg[number + 1]:g} deg")
@@ -157,6 +170,17 @@ def _data(sheet: Path | None) -> int:
 
         draw(shapes.load("train"), sheet)
         print(f"drawn: {sheet}")
+    return 0
+
+
+def _robustness(scale: str, results: Path, seed: int) -> int:
+    from corrmat import robustness
+
+    folder = results / scale / "robustness"
+    found = robustness.run(folder, draws=20 if scale == "smoke" else 400, seed=seed)
+    print("rotation error, mean, deg, where so many per cent are corrupted:\n")
+    print(robustness.terminal_table(found))
+    print(f"\nrecord: {folder}")
     return 0
 
 

@@ -7,6 +7,7 @@ import shutil
 import sys
 import warnings
 import zlib
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,9 +26,11 @@ from corrmat.baselines import BASELINES, UNTRAINED
 from corrmat.callbacks import Curve, SaveOnInterrupt, say
 from corrmat.data.datamodule import RegistrationDataModule
 from corrmat.errors import CorrmatError
+from corrmat.losses import CorrespondenceLoss
 from corrmat.methods import METHODS
 from corrmat.module import OptimizerSettings, RegistrationModule
 from corrmat.recipe import Recipe
+from corrmat.types import PairBatch, Prediction
 
 Settings = Any  # jsonargparse.Namespace with seed, data, network, optimizer, trainer
 BEST = "val/rotation_error_deg_mean"
@@ -84,23 +87,24 @@ def run(recipe: Recipe, results: Path, runs: Path) -> dict[str, Any]:
     """
     place = Path(recipe.scale, recipe.data, recipe.id)
     ready = [prepare(name, settings) for name, settings in recipe.settings.items()]
-    scores, rows = {}, []
+    scores, rows, seen = {}, [], None
     for arm in ready:
         say(f"\n{recipe.id} {arm.name} ({recipe.scale}, {recipe.data})")
         folder = runs / place / arm.name
         trained = _reusable(recipe, arm, runs) or train(arm, folder, group=str(place))
-        tests = evaluate(arm, trained.checkpoint, recipe.bands_deg)
-        scores[arm.name] = record.scores(tests, recipe.bands_deg) | {
+        module = trained_module(arm, trained.checkpoint)
+        tests, found = _tested(module, arm, recipe)
+        scores[arm.name] = found | {
             "pairs_seen": trained.pairs_seen,
             "train_seconds": round(trained.train_seconds, 1),
             "trained_at": trained.commit,
             "curve": trained.curve,
         }
         rows += record.rows(arm.name, tests)
+        seen = seen or _first_pair(module, arm)
     baselines = {}
     for name in recipe.baselines:
-        tests = score(_baseline(name, ready[-1]), ready[-1], recipe.bands_deg)
-        baselines[name] = record.scores(tests, recipe.bands_deg)
+        tests, baselines[name] = _tested(_baseline(name, ready[-1]), ready[-1], recipe)
         rows += record.rows(name, tests)
     found = {
         "id": recipe.id,
@@ -115,7 +119,7 @@ def run(recipe: Recipe, results: Path, runs: Path) -> dict[str, Any]:
         "baselines": baselines,
         "paper": recipe.paper,
     }
-    record.write(results / place, found, recipe, rows)
+    record.write(results / place, found, recipe, rows, seen)
     for arm in ready:
         if (runs / place / arm.name).is_dir():
             (runs / place / arm.name / RECORDED).touch()
@@ -179,37 +183,58 @@ def train(arm: Arm, folder: Path, group: str = "") -> Trained:
     return trained
 
 
-def evaluate(
-    arm: Arm, checkpoint: Path, bands_deg: tuple[float, ...] = ()
-) -> list[dict[str, Tensor]]:
-    """`score` of an arm with the weights of a checkpoint."""
+def trained_module(arm: Arm, checkpoint: Path) -> RegistrationModule:
+    """An arm's module with the weights of a checkpoint."""
     module = make_module(arm.settings)
     load_weights(module, checkpoint)
-    return score(module, arm, bands_deg)
+    return module
+
+
+def bands(edges_deg: tuple[float, ...]) -> list[dict[str, float]]:
+    """How test pairs are drawn for rotation bands; once and as in training if there are none.
+
+    With bands their angles lie between neighbouring edges and there is no translation (tables
+    1 and 2 of the paper).
+    """
+    return [
+        {"min_rotation_deg": low, "rotation_deg": high, "translation": 0.0}
+        for low, high in zip(edges_deg, edges_deg[1:], strict=False)
+    ] or [{}]
 
 
 def score(
-    module: RegistrationModule, arm: Arm, bands_deg: tuple[float, ...] = ()
+    module: RegistrationModule, arm: Arm, how: Sequence[dict[str, float]] = ({},)
 ) -> list[dict[str, Tensor]]:
-    """Score a module on an arm's frozen test pairs; per-pair values, one set a rotation band.
+    """Score a module on an arm's frozen test pairs.
 
-    Without bands the pairs are drawn as in training. With bands their angles lie between
-    neighbouring edges and there is no translation (tables 1 and 2 of the paper).
+    Args:
+        module: what predicts.
+        arm: whose pairs.
+        how: changes to how the pairs are drawn (fields of `PairSettings`), one set of pairs each.
+
+    Returns:
+        Per-pair values of each set.
     """
-    how: list[dict[str, float]] = [
-        {"min_rotation_deg": low, "rotation_deg": high, "translation": 0.0}
-        for low, high in zip(bands_deg, bands_deg[1:], strict=False)
-    ]
     quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
     trainer = L.Trainer(**{**trainer_options(arm.settings), **quiet})
     found = []
-    for changes in how or [{}]:
+    for changes in how:
         trainer.test(module, arm.datamodule.test_dataloader(**changes), verbose=False)
         found.append(module.metrics.per_pair())
         names = arm.datamodule.clouds("test")
         found[-1]["category"] = torch.from_numpy(names.labels)[found[-1]["shape"]]
         module.metrics.reset()
     return found
+
+
+def _tested(
+    module: RegistrationModule, arm: Arm, recipe: Recipe
+) -> tuple[list[dict[str, Tensor]], dict[str, Any]]:
+    """Per-pair values, one set a rotation band, and the metrics of all that a recipe asks for."""
+    tests = score(module, arm, bands(recipe.bands_deg))
+    shares = recipe.sweep_outliers
+    sweep = score(module, arm, [{"outliers": share} for share in shares]) if shares else []
+    return tests, record.scores(tests, recipe.bands_deg, dict(zip(shares, sweep, strict=True)))
 
 
 def make_datamodule(settings: Settings) -> RegistrationDataModule:
@@ -241,6 +266,15 @@ def _fresh(settings: Settings) -> RegistrationModule:
     """`make_module` with the weights that the seed gives: what training starts from."""
     L.seed_everything(settings.seed, workers=True, verbose=False)
     return make_module(settings)
+
+
+@torch.no_grad()
+def _first_pair(module: RegistrationModule, arm: Arm) -> tuple[PairBatch, Prediction] | None:
+    """The first test pair and what a METHOD_corr says of it."""
+    if not isinstance(module, CorrespondenceLoss):
+        return None
+    pair = arm.datamodule.test_dataloader().dataset[(0, 0)]
+    return pair, module.cpu().eval()(pair.source, pair.target)
 
 
 def _baseline(name: str, arm: Arm) -> RegistrationModule:

@@ -113,6 +113,21 @@ def transposed_right_matches(predicted: Tensor, match: Tensor) -> Tensor:
     return found.sum(1)
 
 
+def outlier_counts(predicted: Tensor, match: Tensor, num_target: int) -> tuple[Tensor, ...]:
+    """Outliers found, called so, and there: what precision and recall are made of.
+
+    Args:
+        predicted: (B, N) int64, num_target where a point is called an outlier.
+        match: (B, N) int64, num_target where it is one.
+        num_target: M.
+
+    Returns:
+        Three tensors (B,) int64.
+    """
+    called, there = predicted == num_target, match == num_target
+    return (called & there).sum(1), called.sum(1), there.sum(1)
+
+
 def chamfer(prediction: Prediction, batch: PairBatch) -> Tensor:
     """RPMNet's modified Chamfer distance (RPM-Net, section 5.3), squared distances.
 
@@ -137,7 +152,10 @@ class RegistrationMetrics(Metric):
     """
 
     full_state_update = False
-    _STATE = ("shape", "predicted", "truth", "right", "transposed", "rows", "distance")
+    _OUTLIERS = ("outliers_found", "outliers_called", "outliers_there")
+    _STATE = (
+        "shape", "predicted", "truth", "right", "transposed", "rows", "distance", *_OUTLIERS
+    )  # fmt: skip
 
     def __init__(self) -> None:
         super().__init__()
@@ -148,12 +166,14 @@ class RegistrationMetrics(Metric):
         """Add a batch."""
         n, m, c = batch.source.shape[1], batch.target.shape[1], prediction.correspondence
         none = torch.full((len(batch),), torch.nan, dtype=torch.float64, device=batch.source.device)
-        right, transposed = none, none
+        right, transposed, outliers = none, none, [none] * 3
         if c is not None:
             predicted = c.argmax()
             right = right_matches(predicted, batch.match, m).double()
             if n == m and is_match(batch.match, m).all():
                 transposed = transposed_right_matches(predicted, batch.match).double()
+            if c.outlier is not None:
+                outliers = [x.double() for x in outlier_counts(predicted, batch.match, m)]
         values = {
             "shape": batch.shape,
             "predicted": _row(prediction.rotation, prediction.translation),
@@ -162,6 +182,7 @@ class RegistrationMetrics(Metric):
             "transposed": transposed,
             "rows": is_match(batch.match, m).sum(1),
             "distance": chamfer(prediction, batch).double(),
+            **dict(zip(self._OUTLIERS, outliers, strict=True)),
         }
         for name in self._STATE:
             getattr(self, name).append(values[name])
@@ -181,6 +202,7 @@ class RegistrationMetrics(Metric):
             "transposed": cat["transposed"],
             "rows": cat["rows"],
             "chamfer": cat["distance"],
+            **{name: cat[name] for name in self._OUTLIERS},
         }
 
     def compute(self) -> dict[str, float]:
@@ -206,6 +228,8 @@ def summary(per_pair: dict[str, Tensor]) -> dict[str, float]:
         "translation_rmse": (shift.square().mean() / 3).sqrt(),
         "match_accuracy": per_pair["right"].sum() / per_pair["rows"].sum(),
         "transposed_match_accuracy": per_pair["transposed"].sum() / per_pair["rows"].sum(),
+        "outlier_precision": per_pair["outliers_found"].sum() / per_pair["outliers_called"].sum(),
+        "outlier_recall": per_pair["outliers_found"].sum() / per_pair["outliers_there"].sum(),
         "chamfer": per_pair["chamfer"].mean(),
         "recall@5deg_0.05": hit.double().mean(),
         "failed": (~angle.isfinite()).double().sum(),

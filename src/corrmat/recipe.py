@@ -29,6 +29,7 @@ _TOP = {
     "arms",
     "scales",
     "bands_deg",
+    "sweep_outliers",
     "networks_of",
     "baselines",
     "base",
@@ -57,6 +58,7 @@ class Recipe:
     paper: dict[str, Any]  # arm -> what the paper reports, by our metrics' names
     settings: dict[str, Namespace]  # arm -> seed, data, network, optimizer, trainer
     bands_deg: tuple[float, ...]  # edges of rotation bands to test on one by one; may be empty
+    sweep_outliers: tuple[float, ...]  # shares of outliers to test on besides; may be empty
     networks_of: str | None  # the experiment whose trained networks serve here too
     baselines: tuple[str, ...]  # what else is tested: names of `baselines`
 
@@ -108,6 +110,7 @@ def load(path: Path, scale: str, options: list[str], arms: list[str] | None = No
         paper=merged.get("paper", {}),
         settings=settings,
         bands_deg=tuple(merged.get("bands_deg", ())),
+        sweep_outliers=tuple(merged.get("sweep_outliers", ())),
         networks_of=merged.get("networks_of"),
         baselines=_known_baselines(merged.get("baselines", ()), path),
     )

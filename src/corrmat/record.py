@@ -5,6 +5,7 @@ import json
 import math
 import shutil
 import subprocess
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,18 +13,24 @@ import torch
 import yaml
 from torch import Tensor
 
-from corrmat import metrics, report
+from corrmat import figures, metrics, report
 from corrmat.recipe import Recipe
+from corrmat.types import PairBatch, Prediction
 
-FILES = ("per_pair.csv", "config.yaml", "curves.png", "metrics.json")
+FILES = ("per_pair.csv", "config.yaml", "curves.png", "matches.png", "metrics.json")
 
 
-def scores(tests: list[dict[str, Tensor]], bands_deg: tuple[float, ...]) -> dict[str, Any]:
-    """Metrics over all pairs of an arm, and for each rotation band if there are bands.
+def scores(
+    tests: list[dict[str, Tensor]],
+    bands_deg: tuple[float, ...],
+    sweep: Mapping[float, dict[str, Tensor]],
+) -> dict[str, Any]:
+    """Metrics over all pairs of an arm, then of each rotation band and share of outliers, if any.
 
     Args:
         tests: per-pair values (`RegistrationMetrics.per_pair`), one set a band.
         bands_deg: the bands' edges; empty if `tests` holds one set of all pairs.
+        sweep: share of outliers to per-pair values.
     """
     everything = {key: torch.cat([found[key] for found in tests]) for key in tests[0]}
     found_all: dict[str, Any] = metrics.summary(everything)
@@ -31,6 +38,10 @@ def scores(tests: list[dict[str, Tensor]], bands_deg: tuple[float, ...]) -> dict
         found_all["bands"] = [
             {"band_deg": [low, high]} | metrics.summary(found)
             for low, high, found in zip(bands_deg, bands_deg[1:], tests, strict=False)
+        ]
+    if sweep:
+        found_all["sweep"] = [
+            {"outliers": share} | metrics.summary(found) for share, found in sweep.items()
         ]
     return found_all
 
@@ -65,9 +76,21 @@ def _line(arm: str, band: int, found: dict[str, Tensor], i: int) -> dict[str, An
 
 
 def write(
-    folder: Path, record: dict[str, Any], recipe: Recipe, lines: list[dict[str, Any]]
+    folder: Path,
+    record: dict[str, Any],
+    recipe: Recipe,
+    lines: list[dict[str, Any]],
+    seen: tuple[PairBatch, Prediction] | None,
 ) -> None:
-    """Write all files beside their place, then move them in, metrics.json last."""
+    """Write all files beside their place, then move them in, metrics.json last.
+
+    Args:
+        folder: of the record.
+        record: what metrics.json holds.
+        recipe: its settings.
+        lines: of per_pair.csv.
+        seen: a pair and what METHOD_corr says of it, to be drawn.
+    """
     partial = folder.with_name(f".{folder.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
@@ -80,12 +103,20 @@ def write(
         own["data"].pop("root")  # where the data lies is nobody else's business
     config = {"id": recipe.id, "scale": recipe.scale, "arms": settings}
     (partial / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
-    report.curves_figure(record, partial / "curves.png")
+    figures.curves_figure(record, partial / "curves.png")
+    if seen is not None:
+        figures.matches_figure(*seen, _title(record), partial / "matches.png")
     (partial / "metrics.json").write_text(json.dumps(_finite(record), indent=1) + "\n")
     folder.mkdir(parents=True, exist_ok=True)
     for name in FILES:
-        (partial / name).replace(folder / name)
+        if (partial / name).exists():
+            (partial / name).replace(folder / name)
     partial.rmdir()
+
+
+def _title(record: dict[str, Any]) -> str:
+    arm = list(record["arms"])[1]
+    return f"{record['id']} {arm} ({record['scale']}, {record['data']}), the first test pair"
 
 
 def _finite(value: Any) -> Any:  # noqa: ANN401

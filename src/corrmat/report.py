@@ -1,4 +1,4 @@
-"""Records become tables and figures. Numbers come from results/ and from nowhere else."""
+"""Records become tables. Numbers come from results/ and from nowhere else."""
 
 import itertools
 import json
@@ -15,6 +15,8 @@ METRICS: dict[str, tuple[str, str, float]] = {
     "rotation_error_deg_mean": ("rotation error, mean, deg", ".3g", 1),
     "rotation_error_deg_median": ("rotation error, median, deg", ".3g", 1),
     "translation_rmse": ("translation RMSE", ".2g", 1),
+    "outlier_precision": ("outlier class, precision, %", ".1f", 100),
+    "outlier_recall": ("outlier class, recall, %", ".1f", 100),
     "recall@5deg_0.05": ("pairs under 5 deg and 0.05, %", ".1f", 100),
     "chamfer": ("Chamfer distance (squared)", ".2g", 1),
     "failed": ("pairs without an answer", ".0f", 1),
@@ -23,14 +25,13 @@ METRICS: dict[str, tuple[str, str, float]] = {
     "naive_euler_rmse_deg": ("rotation RMSE (naive Euler), deg", ".3g", 1),
     "transposed_match_accuracy": ("matches as released (transposed), %", ".1f", 100),
 }
-BAND_METRICS = ("relative_euler_mae_deg", "match_accuracy", "chamfer")
-# The columns of the paper's figures 5, 6 and 7: what a curve shows, by the arms' family.
-PANELS = {
-    "DCP": ("loss", "match_accuracy", "relative_euler_rmse_deg", "translation_rmse"),
-    "RPMNet": ("loss", "match_accuracy", "rotation_error_deg_mean", "chamfer"),
-    "PCRNet": ("loss", "match_accuracy", "naive_euler_rmse_deg", "rotation_error_deg_mean"),
-}
-COLOURS = ("#d62728", "#1f77b4", "#2ca02c", "#9467bd")  # METHOD red, METHOD_corr blue: the paper's
+PART_METRICS = {
+    "bands": ("relative_euler_mae_deg", "match_accuracy", "chamfer"),
+    "sweep": (
+        "match_accuracy", "rotation_error_deg_median", "relative_euler_rmse_deg",
+        "outlier_precision", "outlier_recall",
+    ),
+}  # fmt: skip
 README_METRICS = (
     "match_accuracy",
     "rotation_error_deg_mean",
@@ -45,24 +46,22 @@ def table(record: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
     arms, baselines, paper = record["arms"], record.get("baselines", {}), record["paper"]
     heads = ["", *arms, "ratio", *baselines, *(f"paper {arm}" for arm in paper), "paper ratio"]
 
-    def cells(name: str, band: int | None) -> list[str] | None:
+    def cells(name: str, part: str = "", index: int = 0) -> list[str] | None:
         ours, others, theirs = (
-            [_value(_of_band(found, band), name) for found in group.values()]
+            [value_of(_part(found, part, index), name) for found in group.values()]
             for group in (arms, baselines, paper)
         )
         if all(value is None for value in ours):
             return None
-        style, factor = METRICS[name][1:]
-        shown = [
-            [_cell(value, style, factor) for value in group] for group in (ours, others, theirs)
-        ]
-        return [*shown[0], _ratio(ours), *shown[1], *shown[2], _ratio(theirs)]
+        text = [[_cell(v, *METRICS[name][1:]) for v in group] for group in (ours, others, theirs)]
+        return [*text[0], _ratio(ours), *text[1], *text[2], _ratio(theirs)]
 
-    rows = [[METRICS[name][0], *found] for name in METRICS if (found := cells(name, None))]
-    for index, (low, high) in enumerate(_bands(record)):
-        for name in BAND_METRICS:
-            if found := cells(name, index):
-                rows.append([f"{low:g} to {high:g} deg: {METRICS[name][0]}", *found])
+    rows = [[METRICS[name][0], *found] for name in METRICS if (found := cells(name))]
+    for part, names in PART_METRICS.items():
+        for index, label in enumerate(_labels(record, part)):
+            for name in names:
+                if found := cells(name, part, index):
+                    rows.append([f"{label}: {METRICS[name][0]}", *found])
     return heads, rows
 
 
@@ -108,7 +107,7 @@ def markdown_summary(records: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _readme_cells(found: Mapping[str, Any]) -> list[str]:
-    return [_cell(_value(found, name), *METRICS[name][1:]) for name in README_METRICS]
+    return [_cell(value_of(found, name), *METRICS[name][1:]) for name in README_METRICS]
 
 
 def markdown_tables(records: Sequence[Mapping[str, Any]]) -> str:
@@ -147,39 +146,6 @@ def refresh(path: Path, name: str, content: str) -> None:
     path.write_text(f"{before}{start}\n{content}\n{end}{after}")
 
 
-def curves_figure(record: Mapping[str, Any], path: Path) -> None:
-    """The paper's columns (`PANELS`), all arms.
-
-    Validation metrics against pairs seen; the paper's final values as dotted lines.
-    """
-    from matplotlib.figure import Figure  # only who draws waits for it
-
-    arms = record["arms"]
-    panels = PANELS[next(iter(arms)).split("_")[0]]
-    figure = Figure(figsize=(15, 3.6), layout="constrained")
-    figure.suptitle(f"{record['id']}  {record['title']}  ({record['scale']}, {record['data']})")
-    for axes, name in zip(figure.subplots(1, len(panels)), panels, strict=True):
-        title, _, factor = METRICS.get(name, ("training loss", "", 1))
-        for arm, colour in zip(arms, COLOURS, strict=False):
-            curve = arms[arm]["curve"]
-            values = [_value(point, name) for point in curve]
-            if None not in values:
-                seen = [point["pairs_seen"] for point in curve]
-                shown = [factor * value for value in values if value is not None]
-                axes.plot(seen, shown, color=colour, marker=".", label=arm)
-            final = _value(record["paper"].get(arm, {}), name)
-            if final is not None:
-                axes.axhline(
-                    factor * final, color=colour, linestyle=":", linewidth=1, label=f"paper, {arm}"
-                )
-        if name not in ("loss", "match_accuracy"):
-            axes.set_yscale("log")
-        axes.set(title=title, xlabel="training pairs seen")
-        axes.grid(alpha=0.3)
-        axes.legend(fontsize="x-small")
-    figure.savefig(path, dpi=110, metadata={"Software": None})
-
-
 def plain(value: Any) -> Any:  # noqa: ANN401
     """Nested settings as dictionaries, lists, numbers and text: what YAML and JSON can say."""
     if isinstance(value, Mapping):
@@ -200,21 +166,25 @@ def _cell(value: float | None, style: str, factor: float) -> str:
     return "" if value is None else format(value * factor, style)
 
 
-def _value(found: Mapping[str, Any], name: str) -> float | None:
+def value_of(found: Mapping[str, Any], name: str) -> float | None:
+    """A metric of an arm, None where it is missing or no number."""
     value = found.get(name)
     return None if value is None or math.isnan(value) else float(value)
 
 
-def _bands(record: Mapping[str, Any]) -> list[tuple[float, float]]:
-    edges = record.get("bands_deg") or []
-    return list(zip(edges, edges[1:], strict=False))
+def _labels(record: Mapping[str, Any], part: str) -> list[str]:
+    """What the parts of an arm's test are called: rotation bands, shares of outliers."""
+    first = next(iter(record["arms"].values()))
+    if part == "bands":
+        return ["{:g} to {:g} deg".format(*found["band_deg"]) for found in first.get(part, [])]
+    return [f"{100 * found['outliers']:g} % outliers" for found in first.get(part, [])]
 
 
-def _of_band(found: Mapping[str, Any], band: int | None) -> Mapping[str, Any]:
-    if band is None:
+def _part(found: Mapping[str, Any], part: str, index: int) -> Mapping[str, Any]:
+    if not part:
         return found
-    bands = found.get("bands", [])
-    return bands[band] if band < len(bands) else {}
+    parts = found.get(part, [])
+    return parts[index] if index < len(parts) else {}
 
 
 def _pairs(record: Mapping[str, Any]) -> float:

@@ -1,5 +1,6 @@
 """A set of clean clouds, and the HDF5 layout in which they are kept (ModelNet40's official one)."""
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,7 +8,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from corrmat.data.normals import estimate
 from corrmat.errors import CorrmatError
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,8 @@ class CloudSet:
 def read_hdf5(path: Path, names: tuple[str, ...]) -> CloudSet:
     """Read one file of the official layout: `data`, `normal`, `label`.
 
+    A file without `normal` gets estimated ones, and a warning says so.
+
     Raises:
         CorrmatError: the file is missing, cut short, lacks an array, or holds NaN points.
     """
@@ -62,7 +68,7 @@ def read_hdf5(path: Path, names: tuple[str, ...]) -> CloudSet:
     try:
         with h5py.File(path) as file:
             points = np.asarray(file["data"], np.float32)
-            normals = np.asarray(file["normal"], np.float32)
+            normals = np.asarray(file["normal"], np.float32) if "normal" in file else None
             labels = np.asarray(file["label"], np.int64).reshape(-1)
     except KeyError as error:
         raise CorrmatError(f"{path} lacks an array of the official layout: {error}") from error
@@ -70,21 +76,27 @@ def read_hdf5(path: Path, names: tuple[str, ...]) -> CloudSet:
         raise CorrmatError(
             f"{path} is not readable HDF5 (cut short?), fetch it again: {error}"
         ) from error
-    if points.ndim != 3 or points.shape[2] != 3 or normals.shape != points.shape:
+    shapes = points.shape, points.shape if normals is None else normals.shape
+    if points.ndim != 3 or points.shape[2] != 3 or shapes[0] != shapes[1]:
         raise CorrmatError(
-            f"{path}: data {points.shape} and normal {normals.shape} are not both (S, P, 3)"
+            f"{path}: data {shapes[0]} and normal {shapes[1]} are not both (S, P, 3)"
         )
     if len(labels) != len(points) or (
         len(labels) and not 0 <= labels.min() <= labels.max() < len(names)
     ):
         raise CorrmatError(f"{path}: labels do not fit {len(points)} shapes of {len(names)} names")
-    for array, kind in ((points, "points"), (normals, "normals")):
-        bad = np.flatnonzero(~np.isfinite(array).all((1, 2)))
-        if len(bad):
-            raise CorrmatError(
-                f"{path}: shape {bad[0]} has NaN or infinite {kind}; remove or mend it"
-            )
+    _all_finite(points, "points", path)
+    if normals is None:
+        log.warning("%s has no normals: estimated from neighbouring points, facing outwards", path)
+        normals = np.stack([estimate(cloud) for cloud in points]) if len(points) else points
+    _all_finite(normals, "normals", path)
     return CloudSet(np.concatenate([points, normals], -1), labels, names)
+
+
+def _all_finite(array: np.ndarray, kind: str, path: Path) -> None:
+    bad = np.flatnonzero(~np.isfinite(array).all((1, 2)))
+    if len(bad):
+        raise CorrmatError(f"{path}: shape {bad[0]} has NaN or infinite {kind}; remove or mend it")
 
 
 def concatenate(parts: Sequence[CloudSet]) -> CloudSet:

@@ -6,7 +6,7 @@ from torch import Tensor, nn
 
 from corrmat.networks.attention import Transformer
 from corrmat.networks.dgcnn import DGCNN
-from corrmat.ops.correspondence import SoftCorrespondence
+from corrmat.networks.outliers import COMPARE, Outlier
 from corrmat.ops.rigid import procrustes
 from corrmat.types import Prediction
 
@@ -22,6 +22,8 @@ class DCPNetwork(nn.Module):
         feedforward: hidden width of its feed-forward blocks.
         edge_channels: widths of DGCNN's edge convolutions.
         k: neighbours of each point, itself included.
+        outlier: how source points without a match get a class of their own (supplement A);
+            "none" for the network of the experiments without outliers.
     """
 
     def __init__(
@@ -32,11 +34,13 @@ class DCPNetwork(nn.Module):
         feedforward: int = 1024,
         edge_channels: tuple[int, ...] = (64, 64, 128, 256),
         k: int = 20,
+        outlier: Outlier = "none",
     ) -> None:
         super().__init__()
         self.min_points = k
         self.embed = DGCNN(width, edge_channels, k)
         self.pointer = Transformer(width, heads, feedforward) if pointer == "transformer" else None
+        self.compare = COMPARE[outlier](width)
 
     def features(self, source: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
         """Features (B, N, d) and (B, M, d) that are compared with each other."""
@@ -47,7 +51,7 @@ class DCPNetwork(nn.Module):
 
     def forward(self, source: Tensor, target: Tensor) -> Prediction:
         """Register source (B, N, 3 or more) to target (B, M, 3 or more); xyz are read."""
-        f_x, f_y = self.features(source, target)
-        c = SoftCorrespondence(f_x, f_y, scale=f_x.shape[-1] ** -0.5)
-        rotation, translation = procrustes(source[..., :3], c.soft_target(target[..., :3]))
+        c = self.compare(*self.features(source, target))
+        y_hat = c.soft_target(target[..., :3])
+        rotation, translation = procrustes(source[..., :3], y_hat, c.weight())
         return Prediction(rotation, translation, c)

@@ -4,9 +4,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from corrmat.networks.outliers import Compare
 from corrmat.networks.pointnet import PointNet
 from corrmat.ops import rigid
-from corrmat.ops.correspondence import SoftCorrespondence
 from corrmat.ops.rigid import procrustes
 from corrmat.types import Prediction, with_earlier
 
@@ -75,12 +75,12 @@ class PCRNetCorrNetwork(nn.Module):
     def __init__(self, width: int = 512) -> None:
         super().__init__()
         self.embed = PointNet(width, nn.BatchNorm1d, bias=False)
+        self.compare = Compare(width)
 
     def forward(self, source: Tensor, target: Tensor) -> Prediction:
         """Register source (B, N, 3 or more) to target (B, M, 3 or more); xyz are read."""
         x, y = source[..., :3], target[..., :3]
-        f_x, f_y = self.embed(x), self.embed(y)
-        c = SoftCorrespondence(f_x, f_y, scale=f_x.shape[-1] ** -0.5)
+        c = self.compare(self.embed(x), self.embed(y))
         return Prediction(*procrustes(x, c.soft_target(y)), c)
 
 
