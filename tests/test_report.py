@@ -4,7 +4,7 @@ import subprocess
 import pytest
 from conftest import ROOT
 
-from corrmat import report
+from corrmat import figures, report
 from corrmat.errors import CorrmatError
 
 RECORD = {
@@ -58,7 +58,7 @@ def test_refresh_writes_between_the_marks_and_nowhere_else(tmp_path):
 
 def test_the_figure_is_drawn_the_same_twice(tmp_path):
     for name in ("a.png", "b.png"):
-        report.curves_figure(RECORD, tmp_path / name)
+        figures.curves_figure(RECORD, tmp_path / name)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
@@ -85,3 +85,24 @@ def test_the_documents_say_what_the_records_say(page, name, make):
     records = report.read_records(ROOT / "results", scale="laptop")
     assert records
     assert shown[1] == make(records)
+
+
+def test_every_place_that_the_map_of_the_paper_names_is_there():
+    """`file.py`: `symbol` in docs/reproduction.md is defined in that file."""
+    text = (ROOT / "docs" / "reproduction.md").read_text()
+    rows = [line for line in text.splitlines() if line.startswith("| ") and "`" in line]
+    named = 0
+    for row in rows:
+        for path, symbols in re.findall(r"`([\w/]+\.py)`: ((?:`\w+`(?:, )?)+)", row):
+            code = (ROOT / "src" / "corrmat" / path).read_text()
+            for symbol in re.findall(r"`(\w+)`", symbols):
+                assert re.search(rf"(def |class |^\s*){symbol}\b", code, re.MULTILINE), (
+                    path,
+                    symbol,
+                )
+                named += 1
+        for path in re.findall(r"`(configs/[\w./]+)`", row):
+            assert (ROOT / path).is_file()
+        for target in re.findall(r"`make ([\w.]+)`", row):
+            assert target in (ROOT / "Makefile").read_text()
+    assert named > 25
