@@ -1,17 +1,22 @@
-"""Speed of the parts that cost: pairs a second, and DCP's training step against a naive twin.
+"""Speed and memory of what costs: pairs a second, and a training step of every network.
 
     make bench        a table on the screen and in results/bench/bench.json
 
-Times are medians after a warm-up. The naive twin is the same network with plain batch-norm
-passes over the edges; both run in one process, so the ratio holds on a noisy machine.
+Times are medians after a warm-up, memory is the peak of a process of its own above what it held
+before its first step. DCP's naive twin is the same network with plain batch-norm passes over the
+edges; both run in one process, so the ratio holds on a noisy machine.
 """
 
 import json
+import multiprocessing
+import resource
 import statistics
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -22,27 +27,35 @@ from twins import PlainNormLinear  # noqa: E402
 
 from corrmat.data import shapes  # noqa: E402
 from corrmat.data.pairs import Key, PairSettings, make_pairs  # noqa: E402
-from corrmat.methods import DCPCorr  # noqa: E402
-from corrmat.module import OptimizerSettings  # noqa: E402
-from corrmat.networks.dcp import DCPNetwork  # noqa: E402
+from corrmat.methods import METHODS  # noqa: E402
+from corrmat.types import PairBatch  # noqa: E402
 
-SIZES = (128, 256, 512, 1024)
-LAPTOP = {"width": 128, "feedforward": 256, "edge_channels": (32, 32, 64, 128), "k": 10}
+DCP_LAPTOP = {"width": 128, "feedforward": 256, "edge_channels": (32, 32, 64, 128), "k": 6}
+RPMNET_LAPTOP = {"width": 32, "k": 32, "annealing_width": 256}
+# method, hyper-parameters, points, batch
+STEPS: tuple[tuple[str, dict[str, Any], int, int], ...] = (
+    *(("DCP_corr", DCP_LAPTOP, n, 4) for n in (128, 256, 512, 1024)),
+    ("DCP_corr", {}, 512, 16),
+    ("RPMNet_corr", RPMNET_LAPTOP, 256, 2),
+    ("RPMNet_corr", {}, 1024, 4),
+    ("PCRNet_corr", {}, 100, 32),
+    ("PCRNet_corr", {}, 1024, 32),
+    ("PCRNet", {}, 100, 8),
+)
 
 
 def main() -> None:
     """Measure, print, write."""
-    clouds = shapes.load("test", 32)
-    rows = [{"what": "pairs", **pairs_a_second(clouds)}]
-    for name, batch, hparams, sizes in (
-        ("laptop network", 4, LAPTOP, SIZES),
-        ("paper network", 2, {}, SIZES[:3]),
-    ):
-        for n in sizes:
-            rows.append({"what": f"training step, {name}, N={n}, batch {batch}"})
-            rows[-1] |= training_step(clouds, n, batch, hparams)
-            print(format_row(rows[-1]), flush=True)
-    print(format_row(rows[0]))
+    rows = [{"what": "pairs, N=512, one core", **pairs_a_second()}]
+    print(format_row(rows[0]), flush=True)
+    for method, hparams, n, batch in STEPS:
+        size = "laptop network" if hparams else "paper's network"
+        row = {"what": f"{method}, {size}, N={n}, batch {batch}"}
+        row |= in_a_process(training_step, method, hparams, n, batch)
+        if method == "DCP_corr":
+            row |= in_a_process(against_naive, hparams, n, min(batch, 4))
+        rows.append(row)
+        print(format_row(row), flush=True)
     path = ROOT / "results" / "bench" / "bench.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     found = {"threads": torch.get_num_threads(), "torch": torch.__version__, "rows": rows}
@@ -50,41 +63,67 @@ def main() -> None:
     print(f"written: {path.relative_to(ROOT)}")
 
 
-def pairs_a_second(clouds: shapes.CloudSet) -> dict[str, float]:
+def pairs_a_second() -> dict[str, float]:
     """Pairs a second on one core, identical sampling, N = 512."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    how = PairSettings(num_points=512)
+    clouds, how = shapes.load("test", 32), PairSettings(num_points=512)
     keys = [Key(0, 0, 0, i) for i in range(16)]
     seconds = median(lambda: make_pairs(clouds, range(16), keys, how), repeats=100)
     torch.set_num_threads(threads)
     return {"pairs_a_second": round(16 / seconds)}
 
 
-def training_step(clouds: shapes.CloudSet, n: int, batch: int, hparams: dict) -> dict[str, float]:
-    """Milliseconds a pair, forward and backward, ours and the naive twin's."""
+def training_step(method: str, hparams: dict[str, Any], n: int, batch: int) -> dict[str, float]:
+    """Milliseconds a pair of a training step, and its peak memory."""
+    pairs, step = build(method, hparams, n, batch)
+    held = peak_mb()
+    seconds = median(step, repeats=3 if n * batch > 2000 else 20)
+    return {"ms_a_pair": round(1e3 * seconds / len(pairs), 1), "peak_mb": round(peak_mb() - held)}
+
+
+def against_naive(hparams: dict[str, Any], n: int, batch: int) -> dict[str, float]:
+    """How many times longer DCP's naive twin takes."""
+    seconds = []
+    for naive in (False, True):
+        _, step = build("DCP_corr", hparams, n, batch, naive)
+        seconds.append(median(step, repeats=5))
+    return {"naive_ratio": round(seconds[1] / seconds[0], 2)}
+
+
+def build(
+    method: str, hparams: dict[str, Any], n: int, batch: int, naive: bool = False
+) -> tuple[PairBatch, Callable[[], None]]:
+    """Pairs, and a function that does one training step on them."""
+    torch.manual_seed(0)
     keys = [Key(0, 0, 0, i) for i in range(batch)]
-    pairs = make_pairs(clouds, range(batch), keys, PairSettings(num_points=n))
+    pairs = make_pairs(shapes.load("test", batch), range(batch), keys, PairSettings(num_points=n))
+    network_type = METHODS[method].network_type
+    module = METHODS[method](network_type(**hparams))
+    adam = torch.optim.Adam(module.parameters(), 1e-4)
+    if naive:
+        for layer in module.network.embed.edge:  # type: ignore[union-attr]
+            layer.__class__ = PlainNormLinear
 
-    def milliseconds(naive: bool) -> float:
-        torch.manual_seed(0)
-        method = DCPCorr(DCPNetwork(**hparams), OptimizerSettings())
-        if naive:
-            for layer in method.network.embed.edge:
-                layer.__class__ = PlainNormLinear
+    def step() -> None:
+        adam.zero_grad()
+        module.loss(module(pairs.source, pairs.target), pairs).backward()
+        adam.step()
 
-        def step() -> None:
-            method.zero_grad()
-            method.loss(method(pairs.source, pairs.target), pairs).backward()
+    return pairs, step
 
-        return 1e3 * median(step, repeats=5) / batch
 
-    ours, naive = milliseconds(naive=False), milliseconds(naive=True)
-    return {
-        "ms_a_pair": round(ours, 1),
-        "naive_ms": round(naive, 1),
-        "ratio": round(naive / ours, 2),
-    }
+def in_a_process(work: Callable[..., dict[str, float]], *arguments: Any) -> dict[str, float]:  # noqa: ANN401
+    """Run in a fresh process, whose peak of memory is its own."""
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        return pool.submit(work, *arguments).result()
+
+
+def peak_mb() -> float:
+    """Largest resident size of this process so far, in megabytes."""
+    size = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return size / 2**20 if sys.platform == "darwin" else size / 2**10
 
 
 def median(work: Callable[[], object], repeats: int) -> float:

@@ -46,6 +46,7 @@ def test_smoke_run_leaves_a_whole_record(identity, tmp_path, capsys):
         "per_pair.csv",
         "curves.png",
         "matches.png",
+        "views.json",
     }
     record = json.loads((folder / "metrics.json").read_text())
     assert list(record["arms"]) == list(found.settings)
@@ -62,6 +63,11 @@ def test_smoke_run_leaves_a_whole_record(identity, tmp_path, capsys):
     assert len(rows) == len(tested) * 8 * bands
     assert list(dict.fromkeys(row["arm"] for row in rows)) == tested
     assert list(record["baselines"]) == list(found.baselines)
+    views = json.loads((folder / "views.json").read_text())
+    assert [view["rank"] for view in views] == ["easiest", "median", "hardest"]
+    errors = [view["rotation_error_deg"] for view in views]
+    assert errors == sorted(errors)
+    assert all(len(view["steps"][-1]["matched"]) == len(view["source"]) for view in views)
     for picture in ("curves.png", "matches.png"):
         assert (folder / picture).read_bytes().startswith(b"\x89PNG")
     assert "correct matches, %" in capsys.readouterr().out

@@ -2,8 +2,10 @@ import pytest
 import torch
 from conftest import random_rotation
 
+from corrmat.data.datamodule import RegistrationDataModule
 from corrmat.losses import CorrespondenceLoss, RegistrationLoss, registration_loss
 from corrmat.methods import RPMNet, RPMNetCorr
+from corrmat.metrics import match_accuracy, rotation_error_deg
 from corrmat.networks.rpmnet import RPMNetwork
 from corrmat.ops.correspondence import SoftCorrespondence
 from corrmat.types import PairBatch, Prediction
@@ -115,3 +117,26 @@ def test_the_papers_settings():
     assert (RPMNet().optimizer.lr, RPMNetCorr().optimizer.lr) == (1e-4, 1e-2)
     last = RPMNetCorr().optimizer
     assert last.lr * last.gamma ** len(last.milestones) == pytest.approx(1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [RPMNet, RPMNetCorr])
+def test_rpmnet_overfits_eight_pairs(method):
+    torch.manual_seed(0)
+    data = RegistrationDataModule(num_points=64, batch_size=8, test_shapes=8)
+    batch = next(iter(data.test_dataloader()))
+    module = method(RPMNetwork(width=32, k=8, radius=0.5, annealing_width=64)).train()
+    adam = torch.optim.Adam(module.parameters(), 2e-3)
+    for _ in range(250):
+        loss = module.loss(module(batch.source, batch.target), batch)
+        adam.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(module.parameters(), 1.0)
+        adam.step()
+    module.eval()
+    with torch.no_grad():
+        found = module(batch.source, batch.target)
+    assert rotation_error_deg(found.rotation, batch.rotation).median() < 2
+    if method is RPMNetCorr:
+        hits = match_accuracy(found.correspondence.argmax(), batch.match, 64)
+        assert hits.mean() > 0.9

@@ -30,7 +30,6 @@ from corrmat.losses import CorrespondenceLoss
 from corrmat.methods import METHODS
 from corrmat.module import OptimizerSettings, RegistrationModule
 from corrmat.recipe import Recipe
-from corrmat.types import PairBatch, Prediction
 
 Settings = Any  # jsonargparse.Namespace with seed, data, network, optimizer, trainer
 BEST = "val/rotation_error_deg_mean"
@@ -87,21 +86,21 @@ def run(recipe: Recipe, results: Path, runs: Path) -> dict[str, Any]:
     """
     place = Path(recipe.scale, recipe.data, recipe.id)
     ready = [prepare(name, settings) for name, settings in recipe.settings.items()]
-    scores, rows, seen = {}, [], None
+    scores, rows, views = {}, [], []
     for arm in ready:
         say(f"\n{recipe.id} {arm.name} ({recipe.scale}, {recipe.data})")
         folder = runs / place / arm.name
         trained = _reusable(recipe, arm, runs) or train(arm, folder, group=str(place))
         module = trained_module(arm, trained.checkpoint)
-        tests, found = _tested(module, arm, recipe)
-        scores[arm.name] = found | {
+        tests, scored = _tested(module, arm, recipe)
+        scores[arm.name] = scored | {
             "pairs_seen": trained.pairs_seen,
             "train_seconds": round(trained.train_seconds, 1),
             "trained_at": trained.commit,
             "curve": trained.curve,
         }
         rows += record.rows(arm.name, tests)
-        seen = seen or _first_pair(module, arm)
+        views = views or _views(module, arm, tests, recipe)
     baselines = {}
     for name in recipe.baselines:
         tests, baselines[name] = _tested(_baseline(name, ready[-1]), ready[-1], recipe)
@@ -119,7 +118,7 @@ def run(recipe: Recipe, results: Path, runs: Path) -> dict[str, Any]:
         "baselines": baselines,
         "paper": recipe.paper,
     }
-    record.write(results / place, found, recipe, rows, seen)
+    record.write(results / place, found, recipe, rows, views)
     for arm in ready:
         if (runs / place / arm.name).is_dir():
             (runs / place / arm.name / RECORDED).touch()
@@ -269,12 +268,27 @@ def _fresh(settings: Settings) -> RegistrationModule:
 
 
 @torch.no_grad()
-def _first_pair(module: RegistrationModule, arm: Arm) -> tuple[PairBatch, Prediction] | None:
-    """The first test pair and what a METHOD_corr says of it."""
+def _views(
+    module: RegistrationModule, arm: Arm, tests: list[dict[str, Tensor]], recipe: Recipe
+) -> list[dict[str, Any]]:
+    """The pairs that a METHOD_corr finds easiest, middling and hardest, to be looked at."""
     if not isinstance(module, CorrespondenceLoss):
-        return None
-    pair = arm.datamodule.test_dataloader().dataset[(0, 0)]
-    return pair, module.cpu().eval()(pair.source, pair.target)
+        return []
+    module.cpu().eval()
+    sizes = [len(found["shape"]) for found in tests]
+    errors = torch.cat([found["rotation_error_deg"] for found in tests])
+    order = errors.argsort().tolist()
+    found = []
+    for rank, place in (("easiest", 0), ("median", len(order) // 2), ("hardest", -1)):
+        part, index = 0, order[place]
+        while index >= sizes[part]:
+            part, index = part + 1, index - sizes[part]
+        pairs = arm.datamodule.test_dataloader(**bands(recipe.bands_deg)[part]).dataset
+        pair = pairs[(0, index)]
+        prediction = module(pair.source, pair.target)
+        error = float(errors[order[place]])
+        found.append(record.view(arm.name, rank, error, pair, prediction))
+    return found
 
 
 def _baseline(name: str, arm: Arm) -> RegistrationModule:

@@ -7,9 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from corrmat.ops import rigid
-from corrmat.report import METRICS, value_of
-from corrmat.types import PairBatch, Prediction
+from corrmat.report import METRICS, family, value_of
 
 # The columns of the paper's figures 5, 6 and 7: what a curve shows, by the arms' family.
 PANELS = {
@@ -27,7 +25,7 @@ def curves_figure(record: Mapping[str, Any], path: Path) -> None:
     Validation metrics against pairs seen; the paper's final values as dotted lines.
     """
     arms = record["arms"]
-    panels = PANELS[next(iter(arms)).split("_")[0]]
+    panels = PANELS[family(record)]
     figure = Figure(figsize=(15, 3.6), layout="constrained")
     figure.suptitle(f"{record['id']}  {record['title']}  ({record['scale']}, {record['data']})")
     for axes, name in zip(figure.subplots(1, len(panels)), panels, strict=True):
@@ -52,34 +50,28 @@ def curves_figure(record: Mapping[str, Any], path: Path) -> None:
     figure.savefig(path, dpi=110, metadata={"Software": None})
 
 
-def matches_figure(batch: PairBatch, prediction: Prediction, title: str, path: Path) -> None:
+def matches_figure(view: Mapping[str, Any], title: str, path: Path) -> None:
     """The paper's figure 8: a pair before and after, right matches green and wrong ones red.
 
     Source black, target blue; points called outliers have a ring, red where they are none.
 
     Args:
-        batch: a batch whose first pair is drawn.
-        prediction: of that batch.
+        view: a pair and what was predicted of it; see `record.view`.
         title: above the figure.
         path: of the PNG.
     """
-    c = prediction.correspondence
-    if c is None:
-        raise ValueError("this network predicts no correspondence to draw")
-    x, y = batch.source[0, :, :3].numpy(), batch.target[0, :, :3].numpy()
-    called, match = c.argmax()[0].numpy(), batch.match[0].numpy()
-    aligned = rigid.apply(
-        prediction.rotation[:1], prediction.translation[:1], batch.source[:1, :, :3]
-    )
-    outlier = called == len(y)
-    right = called == match
-    # Seen from the side on, and the target set aside, so that lines do not hide in the clouds.
-    aside = np.array([1.2 * (np.ptp(x, 0).max() + np.ptp(y, 0).max()) / 2, 0, 0])
-    figure = Figure(figsize=(12, 4.6), layout="constrained")
-    share = right[match < len(y)].mean() if (match < len(y)).any() else 1.0
-    figure.suptitle(f"{title}: {100 * share:.0f} % of the matches are right")
+    x, y, match = (np.asarray(view[name]) for name in ("source", "target", "match"))
+    last = view["steps"][-1]
+    called = np.asarray(last["matched"])
+    aligned = x @ np.asarray(last["rotation"]).T + last["translation"]
+    outlier, right = called == len(y), called == match
+    # The target is set aside, so that lines do not hide in the clouds.
+    aside = np.array([0.6 * (np.ptp(x, 0).max() + np.ptp(y, 0).max()), 0, 0])
+    figure = Figure(figsize=(11, 5), layout="constrained")
+    inlier = (match >= 0) & (match < len(y))
+    figure.suptitle(f"{title}: {100 * right[inlier].mean():.0f} % of the matches are right")
     for place, (source, target, heading) in enumerate(
-        ((x, y + aside, "source, target set aside, matches"), (aligned[0].numpy(), y, "registered"))
+        ((x, y + aside, "source, target set aside, matches"), (aligned, y, "registered"))
     ):
         axes: Any = figure.add_subplot(1, 2, place + 1, projection="3d")
         axes.scatter(*target.T, s=6, color="#1f77b4", label="target")
@@ -87,17 +79,15 @@ def matches_figure(batch: PairBatch, prediction: Prediction, title: str, path: P
         if outlier.any():
             rings = np.where(right[outlier], "#2ca02c", "#d62728")
             axes.scatter(
-                *source[outlier].T,
-                s=60,
-                facecolors="none",
-                edgecolors=rings,
+                *source[outlier].T, s=60, facecolors="none", edgecolors=rings,
                 label="called outlier",
-            )
+            )  # fmt: skip
         for i in np.flatnonzero(~outlier)[:LINES]:
             colour = "#2ca02c" if right[i] else "#d62728"
             axes.plot(*np.stack([source[i], target[called[i]]]).T, color=colour, lw=0.5, alpha=0.6)
         axes.set(title=heading)
-        axes.set_aspect("equal")
+        axes.set_box_aspect(np.ptp(np.concatenate([source, target]), 0), zoom=1.2)
+        axes.view_init(elev=20, azim=-80)
         axes.set_axis_off()
         axes.legend(fontsize="x-small", loc="lower left")
     figure.savefig(path, dpi=110, metadata={"Software": None})

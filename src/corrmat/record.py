@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import yaml
 from torch import Tensor
@@ -17,7 +18,9 @@ from corrmat import figures, metrics, report
 from corrmat.recipe import Recipe
 from corrmat.types import PairBatch, Prediction
 
-FILES = ("per_pair.csv", "config.yaml", "curves.png", "matches.png", "metrics.json")
+FILES = (
+    "per_pair.csv", "config.yaml", "curves.png", "views.json", "matches.png", "metrics.json",
+)  # fmt: skip
 
 
 def scores(
@@ -75,12 +78,49 @@ def _line(arm: str, band: int, found: dict[str, Tensor], i: int) -> dict[str, An
     }
 
 
+def view(
+    arm: str, rank: str, error_deg: float, batch: PairBatch, prediction: Prediction
+) -> dict[str, Any]:
+    """One pair as plain numbers: what figures and pages show of it.
+
+    Args:
+        arm: whose prediction.
+        rank: "easiest", "median" or "hardest" pair of the test.
+        error_deg: its rotation error.
+        batch: a batch of this pair alone.
+        prediction: of that batch, with a correspondence.
+    """
+    steps = [
+        {
+            "rotation": _rounded(step.rotation[0], 6),
+            "translation": _rounded(step.translation[0], 6),
+            "matched": step.correspondence.argmax()[0].tolist(),
+        }
+        for step in prediction.steps
+        if step.correspondence is not None
+    ]
+    return {
+        "arm": arm,
+        "rank": rank,
+        "rotation_error_deg": round(error_deg, 5),
+        "shape": int(batch.shape[0]),
+        "source": _rounded(batch.source[0, :, :3], 4),
+        "target": _rounded(batch.target[0, :, :3], 4),
+        "match": batch.match[0].tolist(),
+        "steps": steps,
+    }
+
+
+def _rounded(values: Tensor, digits: int) -> Any:  # noqa: ANN401
+    return np.round(values.double().numpy(), digits).tolist()
+
+
 def write(
     folder: Path,
     record: dict[str, Any],
     recipe: Recipe,
     lines: list[dict[str, Any]],
-    seen: tuple[PairBatch, Prediction] | None,
+    views: list[dict[str, Any]],
 ) -> None:
     """Write all files beside their place, then move them in, metrics.json last.
 
@@ -89,7 +129,7 @@ def write(
         record: what metrics.json holds.
         recipe: its settings.
         lines: of per_pair.csv.
-        seen: a pair and what METHOD_corr says of it, to be drawn.
+        views: pairs and what METHOD_corr says of them (`view`), by rank of their error.
     """
     partial = folder.with_name(f".{folder.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
@@ -104,19 +144,19 @@ def write(
     config = {"id": recipe.id, "scale": recipe.scale, "arms": settings}
     (partial / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
     figures.curves_figure(record, partial / "curves.png")
-    if seen is not None:
-        figures.matches_figure(*seen, _title(record), partial / "matches.png")
+    (partial / "views.json").write_text(json.dumps(views) + "\n")
+    middle = views[len(views) // 2]
+    figures.matches_figure(middle, _title(record, middle), partial / "matches.png")
     (partial / "metrics.json").write_text(json.dumps(_finite(record), indent=1) + "\n")
     folder.mkdir(parents=True, exist_ok=True)
     for name in FILES:
-        if (partial / name).exists():
-            (partial / name).replace(folder / name)
+        (partial / name).replace(folder / name)
     partial.rmdir()
 
 
-def _title(record: dict[str, Any]) -> str:
-    arm = list(record["arms"])[1]
-    return f"{record['id']} {arm} ({record['scale']}, {record['data']}), the first test pair"
+def _title(record: dict[str, Any], view: dict[str, Any]) -> str:
+    place = f"{record['scale']}, {record['data']}"
+    return f"{record['id']} {view['arm']} ({place}), the {view['rank']} pair"
 
 
 def _finite(value: Any) -> Any:  # noqa: ANN401

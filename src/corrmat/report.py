@@ -32,13 +32,17 @@ PART_METRICS = {
         "outlier_precision", "outlier_recall",
     ),
 }  # fmt: skip
-README_METRICS = (
-    "match_accuracy",
-    "rotation_error_deg_mean",
-    "rotation_error_deg_median",
-    "relative_euler_rmse_deg",
-    "naive_euler_rmse_deg",
-)
+# Which of them the paper calls its rotation error, by the arms' family.
+PAPERS_OWN = {
+    "DCP": "relative_euler_rmse_deg",
+    "RPMNet": "rotation_error_deg_mean",
+    "PCRNet": "naive_euler_rmse_deg",
+}
+
+
+def family(record: Mapping[str, Any]) -> str:
+    """DCP, RPMNet or PCRNet: what a record's arms are variants of."""
+    return next(iter(record["arms"])).split("_")[0]
 
 
 def table(record: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
@@ -86,28 +90,39 @@ def terminal_table(record: Mapping[str, Any]) -> str:
 
 
 def markdown_summary(records: Sequence[Mapping[str, Any]]) -> str:
-    """The README's table: for every record a row an arm, the paper's below those of one id."""
-    heads = ["experiment", "data", "arm", *(METRICS[name][0] for name in README_METRICS), "minutes"]
+    """The README's table: "METHOD → METHOD_corr", a row a record, the paper's below each id."""
+    heads = [
+        "experiment",
+        "data",
+        "correct matches, %",
+        "rotation error, mean, deg",
+        "rotation error, median, deg",
+        "the paper's rotation error, deg",
+        "minutes",
+    ]
     lines = [_row(heads), "|" + "---|" * len(heads)]
     for identity, group in itertools.groupby(records, key=lambda record: record["id"]):
         same = list(group)
         for record in same:
-            for arm, found in record["arms"].items():
-                minutes = f"{found['train_seconds'] / 60:.1f}"
-                start = [f"{identity} {record['scale']}", record["data"], arm]
-                lines.append(_row([*start, *_readme_cells(found), minutes]))
-            for name, found in record.get("baselines", {}).items():
-                start = [f"{identity} {record['scale']}", record["data"], f"*{name}*"]
-                lines.append(_row([*start, *_readme_cells(found), ""]))
-        for arm, found in same[0]["paper"].items():
-            cells = _readme_cells(found)
-            if any(cells):
-                lines.append(_row([f"{identity} paper", "ModelNet40", arm, *cells, ""]))
+            arms = list(record["arms"].values())[:2]
+            minutes = [f"{found['train_seconds'] / 60:.1f}" for found in arms]
+            start = [f"{identity} {family(record)}, {record['scale']}", record["data"]]
+            lines.append(_row([*start, *_pairwise(record, arms), " → ".join(minutes)]))
+        cells = _pairwise(same[0], list(same[0]["paper"].values()))
+        if any(cells):
+            lines.append(_row([f"{identity} {family(same[0])}, paper", "ModelNet40", *cells, ""]))
     return "\n".join(lines)
 
 
-def _readme_cells(found: Mapping[str, Any]) -> list[str]:
-    return [_cell(value_of(found, name), *METRICS[name][1:]) for name in README_METRICS]
+def _pairwise(record: Mapping[str, Any], arms: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Cells "METHOD → METHOD_corr"; empty where neither has a number."""
+    names = ["match_accuracy", "rotation_error_deg_mean", "rotation_error_deg_median"]
+    cells = []
+    for name in [*names, PAPERS_OWN[family(record)]]:
+        values = [value_of(found, name) for found in arms]
+        shown = [_cell(value, *METRICS[name][1:]) or "-" for value in values]
+        cells.append(" → ".join(shown) if set(shown) != {"-"} else "")
+    return cells
 
 
 def markdown_tables(records: Sequence[Mapping[str, Any]]) -> str:

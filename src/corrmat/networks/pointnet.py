@@ -16,7 +16,7 @@ def shared_mlp(channels: Sequence[int], norm: Norm) -> nn.Sequential:
     """
     layers: list[nn.Module] = []
     for inputs, outputs in zip(channels, channels[1:], strict=False):
-        layers += [nn.Conv1d(inputs, outputs, 1), norm(outputs), nn.ReLU()]
+        layers += [nn.Conv1d(inputs, outputs, 1), norm(outputs), nn.ReLU(inplace=True)]
     return nn.Sequential(*layers)
 
 
