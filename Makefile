@@ -11,7 +11,7 @@ BIN := .venv/bin
 EXPERIMENTS := exp1.1 exp1.2 exp1.3 exp1.4 exp2.1 exp2.2 exp2.3 exp2.4 exp3.1 exp3.2 exp3.3
 RUN_OPTIONS = --scale $(SCALE) --data.data $(DATA) $(if $(ROOT),--data.root "$(ROOT)") $(ARGS)
 
-.PHONY: help $(EXPERIMENTS) outliers robustness all smoke docs bench lint format test test-slow lock clean
+.PHONY: help $(EXPERIMENTS) outliers robustness all docs report bench lint format test test-slow lock clean
 
 help:  ## list the targets
 	@echo "make TARGET [SCALE=smoke|laptop|paper] [DATA=shapes|modelnet40] [ROOT=folder] [ARGS='--key value']"
@@ -29,8 +29,11 @@ robustness: .venv/ready  ## figure 2: wrong matches against a wrong rotation vec
 all: robustness $(EXPERIMENTS) outliers  ## every experiment, figure 2 first
 
 docs: .venv/ready  ## rewrite the tables of README.md and the pictures of docs/ from results/
-	$(BIN)/corrmat report
+	$(BIN)/corrmat report --docs .
 	$(BIN)/corrmat data --sheet docs/shapes.png
+
+report: .venv/ready  ## report.html: every record on one page
+	$(BIN)/corrmat report -o report.html
 
 bench: .venv/ready  ## speed: pairs a second, training steps, ratios against a naive twin
 	$(BIN)/python benchmarks/bench.py

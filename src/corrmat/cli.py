@@ -75,9 +75,12 @@ def _command(words: list[str]) -> int:
     figure.add_argument("--seed", type=int, default=0, help="of the draws")
     data = commands.add_parser("data", help="make the embedded data set, draw its families")
     data.add_argument("--sheet", type=Path, metavar="PNG", help="draw one shape of every family")
-    report = commands.add_parser("report", help="rewrite the tables of the documents from results/")
-    report.add_argument("--results", type=Path, default=Path("results"), help="folder of records")
-    report.add_argument("--docs", type=Path, default=Path(), help="folder of README.md and docs/")
+    report = commands.add_parser("report", help="one page, or the documents' tables, from results/")
+    report.add_argument(
+        "results", type=Path, nargs="?", default=Path("results"), help="folder of records"
+    )
+    report.add_argument("-o", "--output", type=Path, help="write all records as one HTML page")
+    report.add_argument("--docs", type=Path, help="folder of README.md and docs/: rewrite tables")
     known, options = parser.parse_known_args(words)
     if known.command == "data":
         _refuse(options)
@@ -87,7 +90,7 @@ def _command(words: list[str]) -> int:
         return _robustness(known.scale, known.results, known.seed)
     if known.command == "report":
         _refuse(options)
-        return _report(known.results, known.docs)
+        return _report(known.results, known.output, known.docs)
     return _experiment(known, options)
 
 
@@ -184,16 +187,27 @@ def _robustness(scale: str, results: Path, seed: int) -> int:
     return 0
 
 
-def _report(results: Path, docs: Path) -> int:
+def _report(results: Path, output: Path | None, docs: Path | None) -> int:
     from corrmat import report
 
-    records = report.read_records(results, scale="laptop")
-    if not records:
-        raise CorrmatError(f"no laptop records in {results}; run an experiment first")
-    pages = docs / "README.md", docs / "docs" / "reproduction.md"
-    report.refresh(pages[0], "results", report.markdown_summary(records))
-    report.refresh(pages[1], "tables", report.markdown_tables(records))
-    print(f"{len(records)} records -> {pages[0]}, {pages[1]}")
+    if output is None and docs is None:
+        raise CorrmatError("what to write? -o report.html, or --docs . for the documents' tables")
+    if not report.read_records(results):
+        raise CorrmatError(f"no records in {results}; run an experiment first")
+    if output is not None:
+        from corrmat import page
+
+        if not output.parent.is_dir():
+            raise CorrmatError(f"no folder {output.parent} to write into")
+        content = page.build(results)
+        output.write_text(content)
+        print(f"{output}: {len(content) / 1e6:.1f} MB, open it in a browser")
+    if docs is not None:
+        records = report.read_records(results, scale="laptop")
+        pages = docs / "README.md", docs / "docs" / "reproduction.md"
+        report.refresh(pages[0], "results", report.markdown_summary(records))
+        report.refresh(pages[1], "tables", report.markdown_tables(records))
+        print(f"{len(records)} records -> {pages[0]}, {pages[1]}")
     return 0
 
 

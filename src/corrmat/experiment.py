@@ -26,6 +26,7 @@ from corrmat.baselines import BASELINES, UNTRAINED
 from corrmat.callbacks import Curve, SaveOnInterrupt, say
 from corrmat.data.datamodule import RegistrationDataModule
 from corrmat.errors import CorrmatError
+from corrmat.files import replace_text
 from corrmat.losses import CorrespondenceLoss
 from corrmat.methods import METHODS
 from corrmat.module import OptimizerSettings, RegistrationModule
@@ -176,7 +177,7 @@ def train(arm: Arm, folder: Path, group: str = "") -> Trained:
         say("training ended before the first validation: the last weights stand for the best")
         trainer.save_checkpoint(checkpoint)
     trained = Trained(checkpoint, curve.pairs, curve.seconds, record.commit(), curve.points)
-    record.replace_text(
+    replace_text(
         done, json.dumps(asdict(trained) | {"checkpoint": trained.checkpoint.name}, indent=1)
     )
     return trained

@@ -168,13 +168,6 @@ def _finite(value: Any) -> Any:  # noqa: ANN401
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def replace_text(path: Path, text: str) -> None:
-    """Write a file so that nobody ever reads half of it."""
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(text)
-    partial.replace(path)
-
-
 def commit() -> str | None:
     """The commit of the code, "+" behind it when files have changed; None outside a checkout."""
     here = Path(__file__).parent

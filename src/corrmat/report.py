@@ -50,21 +50,21 @@ def table(record: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
     arms, baselines, paper = record["arms"], record.get("baselines", {}), record["paper"]
     heads = ["", *arms, "ratio", *baselines, *(f"paper {arm}" for arm in paper), "paper ratio"]
 
-    def cells(name: str, part: str = "", index: int = 0) -> list[str] | None:
+    def texts(name: str, part: str = "", index: int = 0) -> list[str] | None:
         ours, others, theirs = (
             [value_of(_part(found, part, index), name) for found in group.values()]
             for group in (arms, baselines, paper)
         )
         if all(value is None for value in ours):
             return None
-        text = [[_cell(v, *METRICS[name][1:]) for v in group] for group in (ours, others, theirs)]
-        return [*text[0], _ratio(ours), *text[1], *text[2], _ratio(theirs)]
+        text = [[cell(v, name) for v in group] for group in (ours, others, theirs)]
+        return [*text[0], ratio(ours), *text[1], *text[2], ratio(theirs)]
 
-    rows = [[METRICS[name][0], *found] for name in METRICS if (found := cells(name))]
+    rows = [[METRICS[name][0], *found] for name in METRICS if (found := texts(name))]
     for part, names in PART_METRICS.items():
         for index, label in enumerate(_labels(record, part)):
             for name in names:
-                if found := cells(name, part, index):
+                if found := texts(name, part, index):
                     rows.append([f"{label}: {METRICS[name][0]}", *found])
     return heads, rows
 
@@ -120,7 +120,7 @@ def _pairwise(record: Mapping[str, Any], arms: Sequence[Mapping[str, Any]]) -> l
     cells = []
     for name in [*names, PAPERS_OWN[family(record)]]:
         values = [value_of(found, name) for found in arms]
-        shown = [_cell(value, *METRICS[name][1:]) or "-" for value in values]
+        shown = [cell(value, name) or "-" for value in values]
         cells.append(" → ".join(shown) if set(shown) != {"-"} else "")
     return cells
 
@@ -170,14 +170,16 @@ def plain(value: Any) -> Any:  # noqa: ANN401
     return value if isinstance(value, str | int | float | bool | None) else str(value)
 
 
-def _ratio(values: Sequence[float | None]) -> str:
-    """Of METHOD to METHOD_corr, the first two."""
+def ratio(values: Sequence[float | None]) -> str:
+    """Of METHOD to METHOD_corr, the first two, as text; empty where one is missing."""
     if len(values) < 2 or values[0] is None or not values[1]:
         return ""
     return f"{values[0] / values[1]:.3g}"
 
 
-def _cell(value: float | None, style: str, factor: float) -> str:
+def cell(value: float | None, metric: str) -> str:
+    """A metric's value as text; empty where there is none."""
+    _, style, factor = METRICS[metric]
     return "" if value is None else format(value * factor, style)
 
 

@@ -17,9 +17,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from corrmat.data.pairs import Key, generator
+from corrmat.files import replace_text
 from corrmat.metrics import rotation_error_deg
 from corrmat.ops.rigid import axis_angle_to_matrix, procrustes
-from corrmat.record import replace_text
 
 PERCENT = (1, 5, 10, 15, 20, 25, 30, 40, 50, 60, 70, 80, 90, 95, 99)
 SIZES = (64, 512, 1024, 4096)

@@ -1,0 +1,356 @@
+"""All records on one page that needs no server and no network."""
+
+import csv
+import itertools
+import json
+import string
+import subprocess
+from collections.abc import Mapping, Sequence
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from plotly.offline import get_plotlyjs
+
+from corrmat import report
+from corrmat.figures import COLOURS, PANELS
+
+GREEN, RED, BLUE = "#2ca02c", "#d62728", "#1f77b4"
+# What a family's numbers depend on, below src/corrmat; the recipes come on top.
+CODE = ("ops", "losses.py", "module.py", "data")
+FAMILY_CODE = {
+    "DCP": (
+        "networks/dcp.py",
+        "networks/dgcnn.py",
+        "networks/attention.py",
+        "networks/outliers.py",
+    ),
+    "RPMNet": ("networks/rpmnet.py", "networks/ppf.py", "networks/pointnet.py"),
+    "PCRNet": ("networks/pcrnet.py", "networks/pointnet.py", "networks/outliers.py"),
+}
+QUANTILES = np.linspace(0, 1, 201)
+Plots = dict[str, dict[str, Any]]
+
+
+def build(results: Path) -> str:
+    """The page of every record below a folder.
+
+    Args:
+        results: folder of records, as `report.read_records` reads it.
+
+    Returns:
+        HTML with everything in it.
+    """
+    records = report.read_records(results)
+    plots: Plots = {}
+    sections = [_summary(records)]
+    for identity, group in itertools.groupby(
+        sorted(records, key=lambda r: r["id"]), key=lambda r: r["id"]
+    ):
+        same = list(group)
+        articles = [_article(record, results, plots) for record in same]
+        title = escape(f"{identity} {report.family(same[0])}: {same[0]['title']}")
+        sections.append(
+            f'<section id="exp-{identity}"><h2>{title}</h2>{"".join(articles)}</section>'
+        )
+    sections.append(_robustness(results, plots))
+    names = [record["id"] for record in records]
+    nav = "".join(f'<a href="#exp-{i}">{i}</a>' for i in sorted(set(names)))
+    template = string.Template(files("corrmat").joinpath("page.html").read_text())
+    return template.safe_substitute(
+        intro=(
+            "Every number comes from a file in <code>results/</code>: hover over it for the file, "
+            "follow it to the record it belongs to, where the command stands that makes it again. "
+            "METHOD is red, METHOD_corr blue; dotted lines are the paper's final values."
+        ),
+        nav=f'<a href="#summary">summary</a>{nav}<a href="#robustness">figure 2</a>',
+        body="\n".join(sections),
+        plots=json.dumps(plots).replace("</", "<\\/"),
+        plotly=get_plotlyjs(),
+    )
+
+
+def command(record: Mapping[str, Any]) -> str:
+    """What makes a record again."""
+    target = record["id"] if record["id"] == "outliers" else f"exp{record['id']}"
+    scale = "" if record["scale"] == "laptop" else f" SCALE={record['scale']}"
+    data = "" if record["data"] == "shapes" else f" DATA={record['data']} ROOT=..."
+    seed = "" if record["seed"] == 0 else f' ARGS="--seed {record["seed"]}"'
+    return f"make {target}{scale}{data}{seed}"
+
+
+def staleness(record: Mapping[str, Any], repository: Path) -> str:
+    """What has changed since an arm of a record was trained; empty if nothing has.
+
+    Args:
+        record: with the commits that its arms were trained at.
+        repository: a checkout that knows them.
+    """
+    family = report.family(record)
+    code = [f"src/corrmat/{name}" for name in (*CODE, *FAMILY_CODE[family])]
+    code += [f"configs/exp/{record['id']}.yaml", f"configs/{family.lower()}.yaml"]
+    commits = {arm.get("trained_at") or record.get("commit") for arm in record["arms"].values()}
+    if None in commits or any(commit.endswith("+") for commit in commits):
+        return "trained with uncommitted code"
+    changed: set[str] = set()
+    for commit in commits:
+        found = subprocess.run(
+            ["git", "diff", "--name-only", commit, "--", *code],
+            cwd=repository, capture_output=True, text=True,
+        )  # fmt: skip
+        if found.returncode:
+            return (
+                f"commit {commit} is not at hand, so nobody can tell whether the code has changed"
+            )
+        changed |= {Path(name).name for name in found.stdout.split()}
+    return f"changed since: {', '.join(sorted(changed))}" if changed else ""
+
+
+def _summary(records: Sequence[Mapping[str, Any]]) -> str:
+    heads = ["experiment", "scale", "data", "metric", "METHOD", "METHOD_corr", "ratio"]
+    heads += ["paper METHOD", "paper METHOD_corr", "paper ratio"]
+    rows = []
+    for record in sorted(records, key=lambda r: (r["id"], r["scale"], r["data"])):
+        for metric in ("match_accuracy", report.PAPERS_OWN[report.family(record)]):
+            ours = [report.value_of(a, metric) for a in list(record["arms"].values())[:2]]
+            paper = [report.value_of(record["paper"].get(a, {}), metric) for a in record["arms"]][
+                :2
+            ]
+            cells = [_linked(report.cell(v, metric), record, metric) for v in ours]
+            cells.append(report.ratio(ours))
+            cells += [report.cell(v, metric) for v in paper] + [report.ratio(paper)]
+            start = [record["id"], record["scale"], record["data"], report.METRICS[metric][0]]
+            rows.append([*map(escape, start), *cells])
+    return f'<section id="summary"><h2>Summary</h2>{_table(heads, rows)}</section>'
+
+
+def _article(record: Mapping[str, Any], results: Path, plots: Plots) -> str:
+    name = _name(record)
+    folder = results / record["scale"] / record["data"] / record["id"]
+    heads, rows = report.table(record)
+    source = f"results/{record['scale']}/{record['data']}/{record['id']}/metrics.json"
+    cells = [
+        [escape(row[0]), *(f'<span title="{source}">{escape(cell)}</span>' for cell in row[1:])]
+        for row in rows
+    ]
+    plots[f"{name}-curves"] = _curves(record)
+    plots[f"{name}-errors"] = _errors(folder / "per_pair.csv", list(record["arms"]))
+    parts = [
+        f'<article id="{name}"><h3>{escape(record["scale"])}, {escape(record["data"])}</h3>',
+        _provenance(record, source),
+        _plot(f"{name}-curves", "Training curves"),
+        _plot(f"{name}-errors", "Share of test pairs below each rotation error"),
+        f"<details><summary>All numbers</summary>{_table(heads, cells)}</details>",
+        _views(folder / "views.json", name, plots),
+        "</article>",
+    ]
+    return "".join(parts)
+
+
+def _provenance(record: Mapping[str, Any], source: str) -> str:
+    repository = Path(__file__).resolve().parents[2]
+    stale = staleness(record, repository)
+    mark = f' <span class="stale">{escape(stale)}</span>' if stale else ""
+    effort = "; ".join(
+        f"{arm}: {found['pairs_seen']:,} pairs in {found['train_seconds'] / 60:.1f} min, "
+        f"trained at {found.get('trained_at')}"
+        for arm, found in record["arms"].items()
+    )
+    machine = record.get("hardware", {})
+    where = f"{machine.get('threads', '?')} CPU threads" + (", a GPU" if machine.get("gpu") else "")
+    facts = (
+        f"commit {record.get('commit')}, seed {record['seed']}, {where}. {effort}. File: {source}"
+    )
+    return f'<p class="from"><code>{escape(command(record))}</code>. {escape(facts)}{mark}</p>'
+
+
+def _curves(record: Mapping[str, Any]) -> dict[str, Any]:
+    panels = PANELS[report.family(record)]
+    data, layout = [], {"grid": {"rows": 1, "columns": len(panels), "pattern": "independent"}}
+    layout |= {"margin": {"t": 40, "r": 10}, "legend": {"orientation": "h", "y": -0.25}}
+    layout["annotations"] = []
+    for i, name in enumerate(panels):
+        suffix = "" if i == 0 else str(i + 1)
+        title, _, factor = report.METRICS.get(name, ("training loss", "", 1))
+        for arm, colour in zip(record["arms"], COLOURS, strict=False):
+            curve = record["arms"][arm]["curve"]
+            seen = [point["pairs_seen"] for point in curve]
+            values = [report.value_of(point, name) for point in curve]
+            style = {"color": colour}
+            common = {
+                "xaxis": f"x{suffix}",
+                "yaxis": f"y{suffix}",
+                "legendgroup": arm,
+                "line": style,
+            }
+            if None not in values:
+                shown = [factor * value for value in values if value is not None]
+                data.append(
+                    common | {"x": seen, "y": shown, "name": arm, "showlegend": name == panels[0]}
+                )
+            final = report.value_of(record["paper"].get(arm, {}), name)
+            if final is not None and seen:
+                dotted = {"line": style | {"dash": "dot"}, "mode": "lines", "showlegend": False}
+                ends = {"x": [0, seen[-1]], "y": [factor * final] * 2, "name": f"paper, {arm}"}
+                data.append(common | dotted | ends)
+        kind = "linear" if name in ("loss", "match_accuracy") else "log"
+        layout[f"xaxis{suffix}"] = {"title": {"text": "pairs seen"}}
+        layout[f"yaxis{suffix}"] = {"type": kind, "title": {"text": title, "standoff": 4}}
+    return {"data": data, "layout": layout}
+
+
+def _errors(path: Path, arms: Sequence[str]) -> dict[str, Any]:
+    """Empirical distribution of rotation errors, a line an arm or baseline."""
+    errors: dict[str, list[float]] = {}
+    with path.open() as file:
+        for row in csv.DictReader(file):
+            errors.setdefault(row["arm"], []).append(float(row["rotation_error_deg"]))
+    colours = dict(zip(arms, COLOURS, strict=False))
+    data = []
+    for arm, values in errors.items():
+        found = np.quantile(np.nan_to_num(values, nan=180.0), QUANTILES, method="inverted_cdf")
+        style = {"color": colours.get(arm, "#888"), "dash": "solid" if arm in colours else "dash"}
+        shown = [float(f"{max(value, 1e-4):.4g}") for value in found]
+        share = (100 * QUANTILES).round(1).tolist()
+        data.append({"x": shown, "y": share, "name": arm, "line": style})
+    layout = {
+        "xaxis": {"type": "log", "title": {"text": "rotation error, deg"}},
+        "yaxis": {"title": {"text": "% of test pairs below"}},
+        "margin": {"t": 20, "r": 10},
+    }
+    return {"data": data, "layout": layout}
+
+
+def _views(path: Path, name: str, plots: Plots) -> str:
+    """Folds with the easiest, median and hardest pair; nothing for a record without them."""
+    if not path.is_file():
+        return ""
+    places = []
+    for view in json.loads(path.read_text()):
+        key = f"{name}-{view['rank']}"
+        plots[key] = _view(view)
+        label = f"{view['rank']} pair, {view['rotation_error_deg']:.3g} deg"
+        places.append(
+            f'<details class="views"><summary>{escape(label)}: {escape(view["arm"])} in 3-D'
+            f"</summary>{_plot(key, label, 'plot view')}</details>"
+        )
+    return "".join(places)
+
+
+def _view(view: Mapping[str, Any]) -> dict[str, Any]:
+    """A pair that turns with the mouse, and a slider over the turns of the network."""
+    x, y, match = (np.asarray(view[key]) for key in ("source", "target", "match"))
+    aside = np.array([0.6 * (np.ptp(x, 0).max() + np.ptp(y, 0).max()), 0, 0])
+    last = np.asarray(view["steps"][-1]["matched"])
+    stages = [("before", x, y + aside, last)]
+    for number, step in enumerate(view["steps"], 1):
+        moved = x @ np.asarray(step["rotation"]).T + step["translation"]
+        stages.append((f"turn {number}", moved, y, np.asarray(step["matched"])))
+    data: list[dict[str, Any]] = []
+    for index, (_, source, target, matched) in enumerate(stages):
+        outlier, right = matched == len(y), matched == match
+        traces = [
+            _dots(target, "target", BLUE),
+            _dots(source, "source", "#000"),
+            _lines(source, target, matched, right & ~outlier, "right matches", GREEN),
+            _lines(source, target, matched, ~right & ~outlier, "wrong matches", RED),
+            _dots(source[outlier], "called outlier", "#ff7f0e", "circle-open", 6),
+        ]
+        data += [trace | {"visible": index == len(stages) - 1} for trace in traces]
+    steps = [
+        {
+            "label": label,
+            "method": "restyle",
+            "args": [{"visible": [i // 5 == index for i in range(len(data))]}],
+        }
+        for index, (label, *_) in enumerate(stages)
+    ]
+    hidden = {"visible": False}
+    layout = {
+        "scene": {"aspectmode": "data", "xaxis": hidden, "yaxis": hidden, "zaxis": hidden},
+        "sliders": [{"active": len(stages) - 1, "steps": steps}],
+        "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
+        "legend": {"orientation": "h"},
+    }
+    return {"data": data, "layout": layout}
+
+
+def _dots(
+    points: np.ndarray, name: str, colour: str, symbol: str = "circle", size: int = 2
+) -> dict[str, Any]:
+    x, y, z = points.round(4).T.tolist() if len(points) else ([], [], [])
+    marker = {"size": size, "color": colour, "symbol": symbol}
+    common = {"type": "scatter3d", "mode": "markers", "hoverinfo": "skip"}
+    return common | {"x": x, "y": y, "z": z, "name": name, "marker": marker}
+
+
+def _lines(
+    source: np.ndarray,
+    target: np.ndarray,
+    matched: np.ndarray,
+    which: np.ndarray,
+    name: str,
+    colour: str,
+) -> dict[str, Any]:
+    chosen = np.flatnonzero(which)[:: max(1, len(which) // 200)]
+    ends: list[list[float | None]] = [[], [], []]
+    for i in chosen:
+        for axis in range(3):
+            a, b = source[i, axis], target[matched[i], axis]
+            ends[axis] += [round(float(a), 4), round(float(b), 4), None]
+    common = {"type": "scatter3d", "mode": "lines", "hoverinfo": "skip", "line": {"color": colour}}
+    return common | {"x": ends[0], "y": ends[1], "z": ends[2], "name": name}
+
+
+def _robustness(results: Path, plots: Plots) -> str:
+    found = sorted(results.glob("*/robustness/curve.json"))
+    parts = []
+    for path in found:
+        record = json.loads(path.read_text())
+        name = f"robustness-{path.parts[-3]}"
+        data = []
+        for index, (label, curve) in enumerate(record["curves"].items()):
+            line = {
+                "color": RED if label == "rotation vector" else f"hsl(210, 60%, {70 - 12 * index}%)"
+            }
+            data.append({"x": record["percent"], "y": curve["mean"], "name": label, "line": line})
+        for label, points in record["paper"].items():
+            marks = {"symbol": "x", "color": RED if label == "rotation vector" else BLUE}
+            at = {"x": [float(p) for p in points], "y": list(points.values())}
+            data.append(
+                at | {"mode": "markers", "name": f"paper's chart, {label}", "marker": marks}
+            )
+        axes = {"xaxis": {"title": {"text": "per cent corrupted"}}, "margin": {"t": 20, "r": 10}}
+        layout = axes | {"yaxis": {"title": {"text": "rotation error, mean, deg"}}}
+        plots[name] = {"data": data, "layout": layout}
+        source = f"results/{path.parts[-3]}/robustness/curve.json"
+        facts = f"{record['draws']} draws a point, seed {record['seed']}. File: {source}"
+        parts.append(f'<p class="from"><code>make robustness</code>. {escape(facts)}</p>')
+        parts.append(_plot(name, "Rotation error against per cent corrupted"))
+    title = "Figure 2: wrong matches against a wrong rotation vector"
+    return f'<section id="robustness"><h2>{title}</h2>{"".join(parts)}</section>'
+
+
+def _name(record: Mapping[str, Any]) -> str:
+    return f"{record['scale']}-{record['data']}-{record['id']}"
+
+
+def _linked(text: str, record: Mapping[str, Any], metric: str) -> str:
+    place = f"results/{record['scale']}/{record['data']}/{record['id']}/metrics.json"
+    title = escape(f"{metric} in {place}; {command(record)}", quote=True)
+    return f'<a href="#{_name(record)}" title="{title}">{escape(text)}</a>' if text else ""
+
+
+def _plot(name: str, label: str, kind: str = "plot") -> str:
+    return f'<div class="{kind}" data-plot="{name}" role="img" aria-label="{escape(label)}"></div>'
+
+
+def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    head = "".join(f"<th scope=col>{escape(text)}</th>" for text in heads)
+    body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
+    return (
+        f'<div class="wide" tabindex="0"><table><thead><tr>{head}</tr></thead>'
+        f"<tbody>{body}</tbody></table></div>"
+    )

@@ -1,0 +1,153 @@
+"""The report page: everything in it, nothing fetched, every number led back to its file."""
+
+import json
+import re
+import shutil
+import subprocess
+
+import pytest
+from test_report import RECORD
+
+from corrmat import page, record, robustness
+from corrmat.cli import main
+
+BROWSER = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
+
+
+@pytest.fixture
+def results(tmp_path):
+    """Two records, one of them with 3-D views and bands, and figure 2."""
+    root = tmp_path / "results"
+    view = {
+        "arm": "DCP_corr",
+        "rotation_error_deg": 1.5,
+        "shape": 0,
+        "source": [[0, 0, 0], [1, 0, 0], [0, 1, 0]],
+        "target": [[0, 0, 1], [1, 0, 1], [0, 1, 1]],
+        "match": [0, 1, 3],
+        "steps": [
+            {
+                "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+                "translation": [0, 0, 1],
+                "matched": [0, 2, 3],
+            }
+        ],
+    }
+    for identity in ("1.1", "outliers"):
+        found = json.loads(json.dumps(record._finite(RECORD))) | {"id": identity, "seed": 0}
+        found["hardware"] = {"threads": 1, "gpu": False}
+        folder = root / "smoke" / "shapes" / identity
+        folder.mkdir(parents=True)
+        for arm in found["arms"].values():
+            arm["trained_at"] = "0" * 12
+        if identity == "1.1":
+            for arm in found["arms"].values():
+                arm["bands"] = [{"band_deg": [0, 30], "match_accuracy": 0.5}]
+            views = [view | {"rank": rank} for rank in ("easiest", "median", "hardest")]
+            (folder / "views.json").write_text(json.dumps(views))
+        (folder / "metrics.json").write_text(json.dumps(found))
+        rows = ["arm,rotation_error_deg", "DCP,30", "DCP,20", "DCP_corr,1", "DCP_corr,nan"]
+        (folder / "per_pair.csv").write_text("\n".join(rows))
+    robustness.run(root / "smoke" / "robustness", draws=2)
+    return root
+
+
+def test_every_section_is_there_and_nothing_is_fetched(results):
+    html = page.build(results)
+    for name in ("summary", "exp-1.1", "exp-outliers", "smoke-shapes-1.1", "robustness"):
+        assert f'id="{name}"' in html
+    own = html[: html.index("<script>")]  # plotly's code names addresses that it never asks here
+    assert not re.search(r"""(src|href)=["']?(https?:)?//""", own)
+    assert "@import" not in own
+    assert len(html) < 8e6
+    assert "0 to 30 deg: correct matches, %" in html
+    assert "commit 000000000000 is not at hand" in html
+    plots = json.loads(re.search(r'id="plots">(.*?)</script>', html, re.DOTALL)[1])
+    drawn = set(re.findall(r'data-plot="([^"]+)"', html))
+    assert drawn == set(plots)
+    assert {f"smoke-shapes-1.1-{rank}" for rank in ("easiest", "median", "hardest")} < drawn
+
+
+def test_every_number_names_the_file_and_the_command_it_comes_from(results):
+    html = page.build(results)
+    titles = re.findall(r'title="([^"]+)"', html[: html.index("<script>")])
+    assert titles
+    for title in titles:
+        path = re.search(r"results/(\S+?\.json)", title)[1]
+        assert (results / path).is_file()
+    assert (
+        "match_accuracy in results/smoke/shapes/1.1/metrics.json; make exp1.1 SCALE=smoke" in titles
+    )
+    linked = set(re.findall(r'<a href="#([^"]+)"', html))
+    assert linked <= set(re.findall(r'id="([^"]+)"', html))
+
+
+def test_the_slider_of_a_view_shows_one_stage_at_a_time(results):
+    view = json.loads((results / "smoke/shapes/1.1/views.json").read_text())[0]
+    found = page._view(view)
+    steps = found["layout"]["sliders"][0]["steps"]
+    assert [step["label"] for step in steps] == ["before", "turn 1"]
+    for step in steps:
+        assert sum(step["args"][0]["visible"]) == 5
+    names = [trace["name"] for trace in found["data"][5:]]
+    assert names == ["target", "source", "right matches", "wrong matches", "called outlier"]
+    assert found["data"][8]["x"] == [1.0, 0.0, None]  # the one wrong match: 1 -> 2
+    assert found["data"][9]["z"] == [1.0]  # the outlier, moved by the transform
+
+
+def test_a_record_whose_code_has_changed_is_marked(tmp_path):
+    def git(*words):
+        identity = ["-c", "user.name=t", "-c", "user.email=t@t"]
+        found = subprocess.run(
+            ["git", *identity, *words], cwd=tmp_path, capture_output=True, text=True, check=True
+        )
+        return found.stdout.strip()
+
+    code = tmp_path / "src" / "corrmat" / "losses.py"
+    code.parent.mkdir(parents=True)
+    code.write_text("a = 1\n")
+    git("init", "-q")
+    git("add", "-A")
+    git("commit", "-qm", "first")
+    arms = {"DCP": {"trained_at": git("rev-parse", "--short=12", "HEAD")}}
+    found = {"id": "1.1", "arms": arms}
+    assert page.staleness(found, tmp_path) == ""
+    (tmp_path / "README.md").write_text("words change nothing\n")
+    assert page.staleness(found, tmp_path) == ""
+    code.write_text("a = 2\n")
+    assert page.staleness(found, tmp_path) == "changed since: losses.py"
+    arms["DCP"]["trained_at"] += "+"
+    assert page.staleness(found, tmp_path) == "trained with uncommitted code"
+
+
+def test_what_cannot_be_written_is_said_in_one_line(tmp_path, results, capsys):
+    for words, message in (
+        (["report"], "what to write"),
+        (["report", str(tmp_path / "none"), "-o", str(tmp_path / "r.html")], "no records in"),
+        (["report", str(results), "-o", str(tmp_path / "no" / "r.html")], "no folder"),
+    ):
+        assert main(words) == 2
+        assert message in capsys.readouterr().err
+    assert main(["report", str(results), "-o", str(tmp_path / "r.html")]) == 0
+    assert (tmp_path / "r.html").stat().st_size > 4e6
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium at hand")
+@pytest.mark.parametrize("width", [1280, 500])
+def test_a_browser_opens_it_without_a_complaint(width, results, tmp_path):
+    path = tmp_path / "report.html"
+    path.write_text(page.build(results))
+    found = subprocess.run(
+        [
+            BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr",
+            f"--user-data-dir={tmp_path / 'profile'}", f"--window-size={width},4000",
+            "--virtual-time-budget=5000", "--dump-dom", path.as_uri(),
+        ],
+        capture_output=True, text=True, timeout=100,
+    )  # fmt: skip
+    said = [line for line in found.stderr.splitlines() if "CONSOLE" in line]
+    assert not said, said
+    assert found.stdout.count('class="plot js-plotly-plot"') >= 4
+    assert 'id="robustness"' in found.stdout
