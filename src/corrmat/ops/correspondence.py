@@ -48,10 +48,6 @@ class SoftCorrespondence:
         return scores if self.outlier is None else _with_last(scores, self.outlier)
 
     @functools.cached_property
-    def _log_prob(self) -> Tensor:
-        return self._logits.log_softmax(-1)
-
-    @functools.cached_property
     def _prob(self) -> Tensor:
         return self._logits.softmax(-1)
 
@@ -94,9 +90,10 @@ class SoftCorrespondence:
         Returns:
             (B, N) negative log-likelihoods; 0 for rows left out.
         """
-        known = self.is_class(index)
-        chosen = torch.where(known, index, 0).unsqueeze(-1)
-        return torch.where(known, -self._log_prob.gather(2, chosen).squeeze(-1), 0)
+        known = torch.where(self.is_class(index), index, -1)
+        rows = self._logits.flatten(0, 1)
+        loss = F.cross_entropy(rows, known.flatten(), ignore_index=-1, reduction="none")
+        return loss.view_as(index)
 
     def is_class(self, index: Tensor) -> Tensor:
         """Which of these indices, of any shape, name a class of this matrix."""
@@ -106,13 +103,15 @@ class SoftCorrespondence:
 class _LogCorrespondence(SoftCorrespondence):
     """A matrix whose logits are its logarithm already; rows sum to at most one."""
 
-    @property
-    def _log_prob(self) -> Tensor:
-        return self._logits
-
     @functools.cached_property
     def _prob(self) -> Tensor:
         return self._logits.exp()
+
+    def nll(self, index: Tensor) -> Tensor:
+        """-log C at the true match, from the log domain; see `SoftCorrespondence.nll`."""
+        known = self.is_class(index)
+        chosen = torch.where(known, index, 0).unsqueeze(-1)
+        return torch.where(known, -self._logits.gather(2, chosen).squeeze(-1), 0)
 
     def weight(self) -> Tensor:
         """(B, N) in [0, 1]: how much of a row lies on target points."""
