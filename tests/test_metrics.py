@@ -36,6 +36,8 @@ def test_a_perfect_prediction_has_the_perfect_score(batch):
     assert found.pop("recall@5deg_0.05") == 1
     assert found.pop("pairs") == 6
     assert math.isnan(found.pop("transposed_match_accuracy"))  # asks for clouds of one size
+    assert math.isnan(found.pop("outlier_precision"))  # no such class
+    assert math.isnan(found.pop("outlier_recall"))
     assert all(value == pytest.approx(0, abs=1e-5) for value in found.values()), found
 
 
