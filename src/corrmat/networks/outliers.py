@@ -37,7 +37,7 @@ class LeastSquares(Compare):
     def forward(self, f_x: Tensor, f_y: Tensor) -> SoftCorrespondence:
         """Features (B, N, d) and (B, M, d) -> their correspondence matrix."""
         with torch.autocast(f_x.device.type, enabled=False):
-            f_o = outlier_feature(f_y.float() if f_y.dtype != torch.float64 else f_y)
+            f_o = outlier_feature(f_y)
             logit = self.scale * (f_x.to(f_o.dtype) @ f_o.unsqueeze(-1)).squeeze(-1)
         return SoftCorrespondence(f_x, f_y, self.scale, logit)
 

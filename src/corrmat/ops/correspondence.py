@@ -209,7 +209,7 @@ def outlier_feature(feature_target: Tensor, b: float = -1.0) -> Tensor:
         b: the score; the paper chose -1.
 
     Returns:
-        (B, d), in the dtype of the features.
+        (B, d), float32 or wider.
     """
     f = feature_target.double()
     gram = f.mT @ f
@@ -217,7 +217,7 @@ def outlier_feature(feature_target: Tensor, b: float = -1.0) -> Tensor:
     ridge = 1e-9 * gram.diagonal(dim1=1, dim2=2).mean(1)[:, None, None] + 1e-12
     eye = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
     found = torch.linalg.solve(gram + ridge * eye, f.sum(1))
-    return (b * found).to(feature_target.dtype)
+    return (b * found).to(_at_least_float32(feature_target).dtype)
 
 
 def _at_least_float32(feature: Tensor) -> Tensor:
