@@ -91,8 +91,9 @@ def staleness(record: Mapping[str, Any], repository: Path) -> str:
     family = report.family(record)
     code = [f"src/corrmat/{name}" for name in (*CODE, *FAMILY_CODE[family])]
     code += [f"configs/exp/{record['id']}.yaml", f"configs/{family.lower()}.yaml"]
-    commits = {arm.get("trained_at") or record.get("commit") for arm in record["arms"].values()}
-    if None in commits or any(commit.endswith("+") for commit in commits):
+    arms = record["arms"].values()
+    commits = {str(arm.get("trained_at") or record.get("commit")) for arm in arms}
+    if any(commit == "None" or commit.endswith("+") for commit in commits):
         return "trained with uncommitted code"
     changed: set[str] = set()
     for commit in commits:
@@ -168,9 +169,12 @@ def _provenance(record: Mapping[str, Any], source: str) -> str:
 
 def _curves(record: Mapping[str, Any]) -> dict[str, Any]:
     panels = PANELS[report.family(record)]
-    data, layout = [], {"grid": {"rows": 1, "columns": len(panels), "pattern": "independent"}}
-    layout |= {"margin": {"t": 40, "r": 10}, "legend": {"orientation": "h", "y": -0.25}}
-    layout["annotations"] = []
+    data: list[dict[str, Any]] = []
+    layout: dict[str, Any] = {
+        "grid": {"rows": 1, "columns": len(panels), "pattern": "independent"},
+        "margin": {"t": 40, "r": 10},
+        "legend": {"orientation": "h", "y": -0.25},
+    }
     for i, name in enumerate(panels):
         suffix = "" if i == 0 else str(i + 1)
         title, _, factor = report.METRICS.get(name, ("training loss", "", 1))
