@@ -109,7 +109,8 @@ def _experiment_options(command: argparse.ArgumentParser, name: str) -> None:
         )
     else:
         command.add_argument(
-            "--arm", help="one of the recipe's arms, e.g. DCP or DCP_corr (default: its last)"
+            "--arm",
+            help="one of the recipe's arms, e.g. DCP or DCP_corr (default: its METHOD_corr)",
         )
     if name == "evaluate":
         command.add_argument(
@@ -141,7 +142,7 @@ def _experiment(known: argparse.Namespace, options: list[str]) -> int:
     if known.command == "run":
         experiment.run(found, known.results, known.runs)
         return 0
-    name = list(found.settings)[-1]
+    name = next((arm for arm in found.settings if arm.endswith("_corr")), list(found.settings)[-1])
     arm = experiment.prepare(name, found.settings[name])
     folder = known.runs / found.scale / found.data / found.id / name
     if known.command == "fit":
