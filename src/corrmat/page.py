@@ -256,8 +256,8 @@ def _view(view: Mapping[str, Any]) -> dict[str, Any]:
     for index, (_, source, target, matched) in enumerate(stages):
         outlier, right = matched == len(y), matched == match
         traces = [
-            _dots(target, "target", BLUE),
-            _dots(source, "source", "#000"),
+            _dots(_thinned(target), "target", BLUE),
+            _dots(_thinned(source), "source", "#000"),
             _lines(source, target, matched, right & ~outlier, "right matches", GREEN),
             _lines(source, target, matched, ~right & ~outlier, "wrong matches", RED),
             _dots(source[outlier], "called outlier", "#ff7f0e", "circle-open", 6),
@@ -281,10 +281,15 @@ def _view(view: Mapping[str, Any]) -> dict[str, Any]:
     return {"data": data, "layout": layout}
 
 
+def _thinned(points: np.ndarray, most: int = 250) -> np.ndarray:
+    """Every so many points, so that the page stays small."""
+    return points[:: -(-len(points) // most)]
+
+
 def _dots(
     points: np.ndarray, name: str, colour: str, symbol: str = "circle", size: int = 2
 ) -> dict[str, Any]:
-    x, y, z = points.round(4).T.tolist() if len(points) else ([], [], [])
+    x, y, z = points.round(3).T.tolist() if len(points) else ([], [], [])
     marker = {"size": size, "color": colour, "symbol": symbol}
     common = {"type": "scatter3d", "mode": "markers", "hoverinfo": "skip"}
     return common | {"x": x, "y": y, "z": z, "name": name, "marker": marker}
@@ -298,12 +303,12 @@ def _lines(
     name: str,
     colour: str,
 ) -> dict[str, Any]:
-    chosen = np.flatnonzero(which)[:: max(1, len(which) // 200)]
+    chosen = np.flatnonzero(which)[:: max(1, len(which) // 100)]
     ends: list[list[float | None]] = [[], [], []]
     for i in chosen:
         for axis in range(3):
             a, b = source[i, axis], target[matched[i], axis]
-            ends[axis] += [round(float(a), 4), round(float(b), 4), None]
+            ends[axis] += [round(float(a), 3), round(float(b), 3), None]
     common = {"type": "scatter3d", "mode": "lines", "hoverinfo": "skip", "line": {"color": colour}}
     return common | {"x": ends[0], "y": ends[1], "z": ends[2], "name": name}
 
