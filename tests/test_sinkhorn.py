@@ -4,7 +4,14 @@ from twins import sinkhorn_padded
 
 from corrmat.losses import correspondence_loss
 from corrmat.ops.correspondence import SinkhornCorrespondence
-from corrmat.ops.sinkhorn import sinkhorn
+from corrmat.ops.sinkhorn import sinkhorn_potentials
+
+
+def sinkhorn(affinity, iterations, slack):
+    """The logarithm of the normalised matrix; its rows and unit vectors have it as products."""
+    unit = torch.eye(affinity.shape[2], dtype=affinity.dtype).expand(len(affinity), -1, -1)
+    u, v = sinkhorn_potentials(affinity, unit, iterations, slack)
+    return affinity - u.unsqueeze(2) - v.unsqueeze(1)
 
 
 def affinity(generator):

@@ -6,15 +6,17 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from corrmat.ops.sinkhorn import Slack, sinkhorn
+from corrmat.ops.neighbors import take
+from corrmat.ops.sinkhorn import Slack, sinkhorn_potentials
+from corrmat.ops.streaming import argmax_rows, softmax_rows
 
 
 class SoftCorrespondence:
     """C = softmax(scale * F_X F_Y^T), one row per source point (paper section 4).
 
-    The features stand for the matrix: callers ask for what they need of it, and only
-    `logits` and `prob` promise an N x M tensor. With an outlier class (supplement A) it is
-    N x (M + 1), that class last: index M.
+    Vectors stand for the matrix, a logit is the dot product of two of them, and only `logits`
+    and `prob` promise an N x M tensor: all else takes memory linear in N and M. With an outlier
+    class (supplement A) it is N x (M + 1), that class last: index M.
 
     Args:
         feature_source: F_X, (B, N, d).
@@ -42,10 +44,27 @@ class SoftCorrespondence:
         return self.feature_target.shape[1]
 
     @functools.cached_property
+    def _vectors(self) -> tuple[Tensor, Tensor, Tensor | None]:
+        """What logits are dot products of, (B, N, D) and (B, M, D), and the last column's."""
+        return self.scale * self.feature_source, self.feature_target, self.outlier
+
+    def _rows(self, y: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Log-sum-exp of the rows, and the means of y under their softmax; made once."""
+        known = self.__dict__.get("_made")
+        if known is None or (y is not None and known[0] is not y):
+            a, b, last = self._vectors
+            values = b[..., :0] if y is None else y.to(b.dtype)
+            with torch.autocast(a.device.type, enabled=False):
+                known = y, *softmax_rows(a, b, values.detach(), last)
+            self._made = known
+        return known[1:]
+
+    @functools.cached_property
     def _logits(self) -> Tensor:
-        with torch.autocast(self.feature_source.device.type, enabled=False):
-            scores = (self.feature_source * self.scale) @ self.feature_target.mT
-        return scores if self.outlier is None else _with_last(scores, self.outlier)
+        a, b, last = self._vectors
+        with torch.autocast(a.device.type, enabled=False):
+            scores = a @ b.mT
+        return scores if last is None else torch.cat([scores, last.unsqueeze(-1)], -1)
 
     @functools.cached_property
     def _prob(self) -> Tensor:
@@ -61,24 +80,26 @@ class SoftCorrespondence:
 
     def argmax(self) -> Tensor:
         """(B, N) int64: the most probable class of each source point, M for the outlier's."""
-        return self._logits.argmax(-1)
+        with torch.autocast(self.feature_source.device.type, enabled=False):
+            return argmax_rows(*self._vectors)
 
     def weight(self) -> Tensor:
         """(B, N) in [0, 1]: how much of a row lies on target points; 1 - p_outlier."""
-        if self._prob.shape[-1] == self.num_target:
-            return self._prob.new_ones(self._prob.shape[:2])
-        return 1 - self._prob[..., -1]
+        total, _ = self._rows()
+        if self.outlier is None:
+            return torch.ones_like(total)
+        return 1 - (self.outlier - total).exp()
 
     def soft_target(self, y: Tensor) -> Tensor:
         """(B, N, 3): the expected match of each source point, for y (B, M, 3).
 
         Y_hat = C Y; with an outlier class, given that the point is none.
         """
-        with torch.autocast(y.device.type, enabled=False):
-            expected = self._prob[..., : self.num_target] @ y.to(self._prob.dtype)
-            if self._prob.shape[-1] == self.num_target:
-                return expected
-            return expected / self.weight().unsqueeze(-1).clamp_min(1e-20)
+        total, mean = self._rows(y)
+        last = self._vectors[2]
+        if last is None:
+            return mean
+        return mean / (1 - (last - total).exp()).unsqueeze(-1).clamp_min(1e-20)
 
     def nll(self, index: Tensor) -> Tensor:
         """Cross-entropy of each row against its true match (paper section 4, L_CE).
@@ -90,10 +111,14 @@ class SoftCorrespondence:
         Returns:
             (B, N) negative log-likelihoods; 0 for rows left out.
         """
-        known = torch.where(self.is_class(index), index, -1)
-        rows = self._logits.flatten(0, 1)
-        loss = F.cross_entropy(rows, known.flatten(), ignore_index=-1, reduction="none")
-        return loss.view_as(index)
+        total, _ = self._rows()
+        return torch.where(self.is_class(index), total - self._picked(index), 0)
+
+    def _picked(self, index: Tensor) -> Tensor:
+        """(B, N) logits at a class of each row; anything where the index is none."""
+        a, b, last = self._vectors
+        found = (a * take(b, index.clamp(0, self.num_target - 1))).sum(-1)
+        return found if last is None else torch.where(index == self.num_target, last, found)
 
     def is_class(self, index: Tensor) -> Tensor:
         """Which of these indices, of any shape, name a class of this matrix."""
@@ -108,20 +133,13 @@ class _LogCorrespondence(SoftCorrespondence):
         return self._logits.exp()
 
     def nll(self, index: Tensor) -> Tensor:
-        """-log C at the true match, from the log domain; see `SoftCorrespondence.nll`."""
-        known = self.is_class(index)
-        chosen = torch.where(known, index, 0).unsqueeze(-1)
-        return torch.where(known, -self._logits.gather(2, chosen).squeeze(-1), 0)
+        """-log C at the true match; see `SoftCorrespondence.nll`."""
+        return torch.where(self.is_class(index), -self._picked(index), 0)
 
     def weight(self) -> Tensor:
         """(B, N) in [0, 1]: how much of a row lies on target points."""
-        return self._prob[..., : self.num_target].sum(-1)
-
-    def soft_target(self, y: Tensor) -> Tensor:
-        """(B, N, 3): the expected match of each source point given that it has one."""
-        with torch.autocast(y.device.type, enabled=False):
-            expected = self._prob[..., : self.num_target] @ y.to(self._prob.dtype)
-            return expected / self.weight().unsqueeze(-1).clamp_min(1e-20)
+        total, last = self._rows()[0], self._vectors[2]
+        return total.exp() - (0 if last is None else last.exp())
 
 
 class SinkhornCorrespondence(_LogCorrespondence):
@@ -135,8 +153,8 @@ class SinkhornCorrespondence(_LogCorrespondence):
         feature_target: F_Y, (B, M, d), unit vectors.
         beta: (B,) inverse temperature.
         alpha: (B,) squared distance from where on a match is worth less than slack.
-        iterations: of `sinkhorn`.
-        slack: of `sinkhorn`.
+        iterations: of `sinkhorn_potentials`.
+        slack: of `sinkhorn_potentials`.
     """
 
     def __init__(
@@ -154,13 +172,16 @@ class SinkhornCorrespondence(_LogCorrespondence):
         self.slack: Slack = slack
 
     @functools.cached_property
-    def _logits(self) -> Tensor:
+    def _vectors(self) -> tuple[Tensor, Tensor, Tensor | None]:
         f_x, f_y = self.feature_source, self.feature_target
         beta, alpha = self.beta[:, None, None], self.alpha[:, None, None]
+        # beta (alpha - |f_x|^2 - |f_y|^2 + 2 f_x . f_y) as one dot product.
+        own = beta * (alpha - f_x.square().sum(-1, keepdim=True))
+        a = torch.cat([2 * beta * f_x, own, -beta.expand_as(own)], -1)
+        b = torch.cat([F.pad(f_y, (0, 1), value=1.0), f_y.square().sum(-1, keepdim=True)], -1)
         with torch.autocast(f_x.device.type, enabled=False):
-            squares = f_x.square().sum(-1).unsqueeze(2) + f_y.square().sum(-1).unsqueeze(1)
-            affinity = beta * (alpha - squares + 2 * (f_x @ f_y.mT))
-            return sinkhorn(affinity, self.iterations, self.slack)
+            u, v = sinkhorn_potentials(a, b, self.iterations, self.slack)
+        return *_less(a, b, u, v), None
 
 
 class MatchabilityCorrespondence(_LogCorrespondence):
@@ -189,14 +210,34 @@ class MatchabilityCorrespondence(_LogCorrespondence):
         self.matchable_target = _at_least_float32(matchable_target)
 
     @functools.cached_property
-    def _logits(self) -> Tensor:
+    def _vectors(self) -> tuple[Tensor, Tensor, Tensor | None]:
+        a, b, out = super()._vectors
+        assert out is not None
+        with torch.autocast(a.device.type, enabled=False):
+            rows, _ = softmax_rows(a, b, b[..., :0])
+            columns, _ = softmax_rows(b, a, a[..., :0])
+        u, v = rows - F.logsigmoid(-out), columns - F.logsigmoid(self.matchable_target)
+        return *_less(2 * a, b, u, v), F.logsigmoid(out)
+
+    def transposed(self) -> "MatchabilityCorrespondence":
+        """The same matrix with target points as rows, and their doubt as the last class."""
         assert self.outlier is not None
-        with torch.autocast(self.feature_source.device.type, enabled=False):
-            scores = (self.feature_source * self.scale) @ self.feature_target.mT
-            both = scores.log_softmax(2) + scores.log_softmax(1)
-            matchable = F.logsigmoid(-self.outlier).unsqueeze(2)
-            matchable = matchable + F.logsigmoid(self.matchable_target).unsqueeze(1)
-            return _with_last(both + matchable, F.logsigmoid(self.outlier))
+        other = MatchabilityCorrespondence(
+            self.feature_target,
+            self.feature_source,
+            self.scale,
+            self.matchable_target,
+            -self.outlier,
+        )
+        a, b, _ = self._vectors
+        other._vectors = b, a, F.logsigmoid(-self.matchable_target)
+        return other
+
+
+def _less(a: Tensor, b: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+    """Vectors of the dot products a_i . b_j - u_i - v_j."""
+    a = torch.cat([F.pad(a, (0, 1), value=-1.0), -u.unsqueeze(-1)], -1)
+    return a, F.pad(torch.cat([b, v.unsqueeze(-1)], -1), (0, 1), value=1.0)
 
 
 def outlier_feature(feature_target: Tensor, b: float = -1.0) -> Tensor:
@@ -222,7 +263,3 @@ def outlier_feature(feature_target: Tensor, b: float = -1.0) -> Tensor:
 
 def _at_least_float32(feature: Tensor) -> Tensor:
     return feature if feature.dtype == torch.float64 else feature.float()
-
-
-def _with_last(scores: Tensor, last: Tensor) -> Tensor:
-    return torch.cat([scores, last.unsqueeze(-1)], -1)
