@@ -11,7 +11,7 @@ BIN := .venv/bin
 EXPERIMENTS := exp1.1 exp1.2 exp1.3 exp1.4 exp2.1 exp2.2 exp2.3 exp2.4 exp3.1 exp3.2 exp3.3
 RUN_OPTIONS = --scale $(SCALE) --data.data $(DATA) $(if $(ROOT),--data.root "$(ROOT)") $(ARGS)
 
-.PHONY: help $(EXPERIMENTS) outliers robustness all docs report bench lint format test test-slow lock clean
+.PHONY: help $(EXPERIMENTS) outliers robustness all weights protocols docs report bench lint format test test-slow lock clean
 
 help:  ## list the targets
 	@echo "make TARGET [SCALE=smoke|laptop|paper] [DATA=shapes|modelnet40] [ROOT=folder] [ARGS='--key value']"
@@ -27,6 +27,12 @@ robustness: .venv/ready  ## figure 2: wrong matches against a wrong rotation vec
 	$(BIN)/python reproduce/robustness.py --scale $(SCALE)
 
 all: robustness $(EXPERIMENTS) outliers  ## every experiment, figure 2 first
+
+weights: .venv/ready  ## train what `corrmat register` ships on the embedded shapes, put it into the package
+	$(BIN)/python reproduce/weights.py --scale $(SCALE) $(ARGS)
+
+protocols: .venv/ready  ## the shipped weights beside the classical pipelines (pip install open3d), into results/register
+	$(BIN)/python benchmarks/protocols.py $(if $(ROOT),--root "$(ROOT)")
 
 docs: .venv/ready  ## rewrite the tables of README.md and the pictures of docs/ from results/
 	$(BIN)/corrmat report --docs .

@@ -1,6 +1,7 @@
 """Smoke training of every experiment, and what a run promises besides its numbers."""
 
 import csv
+import io
 import json
 import math
 import os
@@ -11,8 +12,9 @@ import socket
 import pytest
 import torch
 from conftest import ROOT, shared
+from rich.console import Console
 
-from corrmat import experiment, recipe
+from corrmat import console, experiment, recipe
 from corrmat.errors import CorrmatError
 from corrmat.module import RegistrationModule
 
@@ -24,8 +26,26 @@ def load(identity, *options, arms=None):
     return recipe.load(path, "smoke", ["--trainer.enable_progress_bar", "false", *options], arms)
 
 
-def train(name, settings, folder):
-    return experiment.train(experiment.prepare(name, settings), folder)
+def train(name, settings, folder, **how):
+    return experiment.train(experiment.prepare(name, settings), folder, **how)
+
+
+def read_wandb(path):
+    """Records of an offline run: wandb keeps them in LevelDB's log format."""
+    from wandb.proto.wandb_internal_pb2 import Record
+
+    content, at, part = path.read_bytes(), 7, b""
+    while at + 7 <= len(content):
+        left = 32768 - at % 32768
+        if left < 7:  # no header fits into the rest of a block
+            at += left
+            continue
+        size, kind = int.from_bytes(content[at + 4 : at + 6], "little"), content[at + 6]
+        part += content[at + 7 : at + 7 + size]
+        at += 7 + size
+        if kind in (1, 4):  # whole, or the last of several
+            yield Record.FromString(part)
+            part = b""
 
 
 def numbers(record):
@@ -237,7 +257,9 @@ def test_a_loss_that_is_no_number_stops_the_run_and_leaves_no_record(tmp_path, m
     assert not (tmp_path / "results").exists()
 
 
-def test_wandb_writes_offline_and_touches_no_network(tmp_path, monkeypatch):
+@pytest.fixture
+def no_network(monkeypatch):
+    """wandb as users have it, and an error for whoever connects to another machine."""
     monkeypatch.delenv("WANDB_MODE")
 
     def blocked(self, address):
@@ -247,12 +269,66 @@ def test_wandb_writes_offline_and_touches_no_network(tmp_path, monkeypatch):
 
     original = socket.socket.connect
     monkeypatch.setattr(socket.socket, "connect", blocked)
-    train("DCP", load("1.1").settings["DCP"], tmp_path / "DCP")
-    logs = list((tmp_path / "DCP" / "wandb").glob("offline-run-*/*.wandb"))
-    assert len(logs) == 1
-    assert logs[0].stat().st_size > 0
-    steps = list(csv.DictReader((tmp_path / "DCP" / "csv" / "version_0" / "metrics.csv").open()))
+
+
+def test_wandb_holds_config_curves_table_pictures_and_clouds_offline(tmp_path, no_network):
+    found = load("1.2")
+    experiment.run(found, tmp_path / "results", tmp_path / "runs", logger="wandb")
+    runs = tmp_path / "runs" / "smoke" / "shapes" / "1.2"
+    read = {}
+    for path in runs.glob("**/offline-run-*/*.wandb"):
+        records = list(read_wandb(path))
+        run = next(record.run for record in records if record.HasField("run"))
+        assert run.run_group == "smoke/shapes/1.2"
+        read[run.job_type] = path.parent, records, run
+    assert set(read) == {"DCP", "DCP_corr", "record"}
+
+    def history(job):
+        items = [item for r in read[job][1] if r.HasField("history") for item in r.history.item]
+        return {item.key or "/".join(item.nested_key): item.value_json for item in items}
+
+    for job in ("DCP", "DCP_corr"):
+        assert {"train/loss", "val/rotation_error_deg_mean"} <= set(history(job))
+        config = {item.key: json.loads(item.value_json) for item in read[job][2].config.update}
+        assert config["network"]["width"] == 32
+        assert config["data"]["keep"] == 0.7
+    logged = {name: json.loads(value) for name, value in history("record").items()}
+    kinds = {"table": "table-file", "curves": "image-file", "pair/hardest": "object3D-file"}
+    for name, kind in kinds.items():
+        assert logged[f"{name}/_type"] == kind
+        path = read["record"][0] / "files" / logged[f"{name}/path"]
+        assert path.stat().st_size > 100
+    content = json.loads((read["record"][0] / "files" / logged["table/path"]).read_text())
+    assert "DCP_corr" in content["columns"]
+    steps = list(csv.DictReader((runs / "DCP" / "csv" / "version_0" / "metrics.csv").open()))
     assert any(row["val/match_accuracy"] for row in steps)
+
+
+@pytest.mark.parametrize(("logger", "there"), [("csv", {"csv"}), ("none", set())])
+def test_loggers_can_be_left_out(logger, there, tmp_path, no_network):
+    train("DCP", load("1.1").settings["DCP"], tmp_path / "DCP", logger=logger)
+    assert {name for name in ("csv", "wandb") if (tmp_path / "DCP" / name).exists()} == there
+
+
+def test_a_board_shows_every_arm(tmp_path):
+    text = io.StringIO()
+    console.listen(0)
+    board = console.Board(Console(file=text, force_terminal=True, width=120))
+    settings = load("1.1").settings["DCP_corr"]
+    with board:
+        train("DCP_corr", settings, tmp_path / "run", board=board)
+    shown = text.getvalue()
+    for word in ("arm", "pairs/s", "time left", "DCP_corr", "8/8", "rotation error", "done in 0:0"):
+        assert word in shown
+    assert board.rows["DCP_corr"]["rotation error"].endswith("°")
+
+
+def test_a_board_that_nobody_watches_draws_nothing(tmp_path):
+    text = io.StringIO()
+    with console.Board(Console(file=text)) as board:
+        board.update("DCP", step="1/2")
+    assert not board.watched
+    assert text.getvalue() == ""
 
 
 def test_checkpoints_reload_to_the_same_network(tmp_path):

@@ -65,8 +65,9 @@ def test_the_figure_is_drawn_the_same_twice(tmp_path):
 @pytest.mark.parametrize(
     ("page", "name", "make"),
     [
-        ("README.md", "results", report.markdown_summary),
-        ("docs/reproduction.md", "tables", report.markdown_tables),
+        ("README.md", "results", lambda records, _: report.markdown_summary(records)),
+        ("docs/reproduction.md", "tables", lambda records, _: report.markdown_tables(records)),
+        ("README.md", "register", lambda _, results: report.markdown_register(results)),
     ],
 )
 def test_the_documents_say_what_the_records_say(page, name, make):
@@ -84,7 +85,7 @@ def test_the_documents_say_what_the_records_say(page, name, make):
     shown = re.search(f"<!-- {name} -->\n(.*)\n<!-- /{name} -->", text, re.DOTALL)
     records = report.read_records(ROOT / "results", scale="laptop")
     assert records
-    assert shown[1] == make(records)
+    assert shown[1] == make(records, ROOT / "results")
 
 
 def test_every_place_that_the_map_of_the_paper_names_is_there():

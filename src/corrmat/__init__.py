@@ -11,18 +11,22 @@ if TYPE_CHECKING:
     from corrmat import methods, metrics
     from corrmat.data.datamodule import RegistrationDataModule
     from corrmat.errors import CorrmatError
+    from corrmat.registration import Registration, register
     from corrmat.types import PairBatch, Prediction
-    from corrmat.weights import load_reference
+    from corrmat.weights import load_model, load_reference
 
 __version__ = "0.1.0"
 __all__ = [
     "CorrmatError",
     "PairBatch",
     "Prediction",
+    "Registration",
     "RegistrationDataModule",
+    "load_model",
     "load_reference",
     "methods",
     "metrics",
+    "register",
 ]
 
 _HOME = {
@@ -30,7 +34,10 @@ _HOME = {
     "PairBatch": "corrmat.types",
     "Prediction": "corrmat.types",
     "RegistrationDataModule": "corrmat.data.datamodule",
+    "Registration": "corrmat.registration",
+    "load_model": "corrmat.weights",
     "load_reference": "corrmat.weights",
+    "register": "corrmat.registration",
 }
 
 

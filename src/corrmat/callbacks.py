@@ -1,5 +1,6 @@
 """What happens beside the training step: the curve that figures show, and Ctrl-C."""
 
+import logging
 import math
 import signal
 import threading
@@ -9,7 +10,7 @@ from typing import Any
 
 import lightning as L
 import torch
-from lightning.pytorch.callbacks import Callback, TQDMProgressBar
+from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 
 from corrmat.types import PairBatch
@@ -71,8 +72,7 @@ class Curve(Callback):
             f"rotation {values['rotation_error_deg_mean']:7.2f} deg mean, "
             f"{values['rotation_error_deg_median']:6.2f} median"
         )
-        bar = trainer.progress_bar_callback
-        bar.print(line) if isinstance(bar, TQDMProgressBar) else say(line)
+        say(line)
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Stop the clock."""
@@ -162,5 +162,5 @@ class SaveOnInterrupt(Callback):
 
 
 def say(text: str) -> None:
-    """Print a line for the user."""
-    print(text, flush=True)
+    """A line for whoever watches: see `console.listen`."""
+    logging.getLogger("corrmat").info(text)

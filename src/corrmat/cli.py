@@ -1,4 +1,4 @@
-"""The command line: corrmat run | fit | evaluate | robustness | data | report."""
+"""The command line: corrmat register, example, run, fit, evaluate, robustness, data, report."""
 
 import argparse
 import sys
@@ -7,6 +7,8 @@ from pathlib import Path
 from corrmat.errors import CorrmatError
 
 EPILOG = """examples:
+  corrmat register source.ply target.ply -o aligned.ply --html view.html
+      how your own two clouds lie to each other (corrmat example DIR writes two to try)
   corrmat run --config configs/exp/1.1.yaml
       both arms at laptop scale, our numbers beside the paper's
   corrmat run --config configs/exp/1.2.yaml --scale smoke
@@ -15,6 +17,8 @@ EPILOG = """examples:
       one arm, with any setting changed
   corrmat evaluate --config configs/exp/1.1.yaml --arm DCP_corr
       the best checkpoint of the last run (or --checkpoint FILE) on the frozen test pairs
+  corrmat evaluate --models corrmat,ransac,fgr,icp --protocol real
+      the shipped weights beside the classical pipelines, on the same frozen pairs
   corrmat robustness
       figure 2 of the paper: curve and picture in results/laptop/robustness
   corrmat data --sheet shapes.png
@@ -25,6 +29,20 @@ Whatever a recipe sets can be set here: --data.*, --network.*, --optimizer.*, --
 
 exit codes: 0 done; 1 interrupted (the same command goes on from its checkpoint);
 2 something given cannot be used, and one line says what."""
+
+
+REGISTER_EPILOG = """examples:
+  corrmat register scan1.ply scan2.ply
+      print the 4 x 4 matrix that takes scan1 onto scan2, and how far to trust it
+  corrmat register part.stl scan.pcd -o aligned.ply --json T.json --html view.html
+      write the moved source, the result for programs, and a page to look at
+  corrmat register a.npy b.npy --model ransac
+      the classical pipeline instead (pip install 'corrmat[baselines]')
+
+Files: PLY, OBJ, STL, OFF, GLB, GLTF (meshes are sampled, scenes merged), PCD, XYZ, TXT, CSV,
+NPY, NPZ. Any units, as long as both files have the same. Parts may be missing from either.
+
+exit codes: 0 done, whatever the verdict; 2 a file cannot be used, and one line says why."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -66,6 +84,12 @@ def _command(words: list[str]) -> int:
             name, help=purpose, description=purpose, add_help=False, allow_abbrev=False
         )
         _experiment_options(command, name)
+    _register_options(commands.add_parser(
+        "register", help="how two clouds of your own lie to each other", epilog=REGISTER_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    ))  # fmt: skip
+    example = commands.add_parser("example", help="write two scans to try register on")
+    example.add_argument("folder", type=Path, help="for source.ply, target.ply and truth.json")
     figure = commands.add_parser(
         "robustness", help="figure 2: wrong matches against a wrong rotation vector"
     )
@@ -85,6 +109,12 @@ def _command(words: list[str]) -> int:
     if known.command == "data":
         _refuse(options)
         return _data(known.sheet)
+    if known.command == "register":
+        _refuse(options)
+        return _register(known)
+    if known.command == "example":
+        _refuse(options)
+        return _example(known.folder)
     if known.command == "robustness":
         _refuse(options)
         return _robustness(known.scale, known.results, known.seed)
@@ -103,6 +133,16 @@ def _experiment_options(command: argparse.ArgumentParser, name: str) -> None:
     command.add_argument(
         "--runs", type=Path, default=Path("runs"), help="folder of checkpoints and logs"
     )
+    if name in ("run", "fit"):
+        command.add_argument(
+            "--logger",
+            choices=["none", "csv", "wandb"],
+            default="wandb",
+            help="wandb (default): CSV and wandb offline; csv; none. The record is written anyway",
+        )
+        loud = command.add_mutually_exclusive_group()
+        loud.add_argument("-q", "--quiet", action="store_true", help="print nothing but results")
+        loud.add_argument("-v", "--verbose", action="store_true", help="Lightning's messages, too")
     if name == "run":
         command.add_argument(
             "--results", type=Path, default=Path("results"), help="folder of records"
@@ -114,14 +154,92 @@ def _experiment_options(command: argparse.ArgumentParser, name: str) -> None:
         )
     if name == "evaluate":
         command.add_argument(
+            "--models",
+            help="instead of an arm: register pairs of a protocol with these and compare them, "
+            "e.g. corrmat,ransac,fgr,icp or checkpoint files",
+        )
+        command.add_argument(
+            "--protocol",
+            default="real",
+            choices=["paper", "real", "clean"],
+            help="of --models. real: disjoint samples, noise, crop and outliers in both; "
+            "clean: without crop and outliers; paper: experiment 1.2's pairs",
+        )
+        command.add_argument("--data", default="shapes", choices=["shapes", "modelnet40"],
+            help="of --models")  # fmt: skip
+        command.add_argument("--root", type=Path, help="folder of modelnet40, of --models")
+        command.add_argument("--points", type=int, default=512, help="a cloud, of --models")
+        command.add_argument("--pairs", type=int, default=120, help="of --models")
+        command.add_argument(
+            "--record", type=Path, metavar="JSON", help="write table and per-pair values"
+        )
+        command.add_argument(
             "--checkpoint", type=Path, help="default: best.ckpt of the arm's last fit or run"
         )
     command.set_defaults(usage_text=command.format_help())
 
 
+def _register_options(command: argparse.ArgumentParser) -> None:
+    command.add_argument("source", type=Path, help="the cloud or mesh that is moved")
+    command.add_argument("target", type=Path, help="the cloud or mesh that it is moved onto")
+    command.add_argument("-o", "--output", type=Path, metavar="PLY", help="write the moved source")
+    command.add_argument("--json", type=Path, help="write matrix, confidence and verdict")
+    command.add_argument("--html", type=Path, help="write a page: before, after, matches")
+    command.add_argument(
+        "--model",
+        default="corrmat",
+        help="corrmat (the shipped weights, default), icp, ransac, fgr, or a checkpoint file",
+    )
+    command.add_argument(
+        "--refine", choices=["icp", "none"], default="icp", help="after the model's guess"
+    )
+    command.add_argument("--seed", type=int, default=0, help="of subsampling and of draws")
+
+
+def _register(known: argparse.Namespace) -> int:
+    for path in (known.output, known.json, known.html):
+        if path is not None and not path.parent.is_dir():
+            raise CorrmatError(f"no folder {path.parent} to write {path.name} into")
+
+    from corrmat.data.scans import read_scan, write_ply
+    from corrmat.files import replace_text
+
+    source, target = (read_scan(path, known.seed) for path in (known.source, known.target))
+
+    from corrmat import registration, view
+
+    found = registration.register(
+        source, target, model=known.model, refine=known.refine, seed=known.seed
+    )
+    print(registration.text(found))
+    if known.output is not None:
+        rotation, translation = found.transform[:3, :3], found.transform[:3, 3]
+        write_ply(known.output, source @ rotation.T + translation)
+        print(f"source, moved: {known.output}")
+    if known.json is not None:
+        replace_text(known.json, registration.json_text(found))
+        print(f"result: {known.json}")
+    if known.html is not None:
+        replace_text(known.html, view.page(found, source, target))
+        print(f"to look at: {known.html}")
+    return 0
+
+
+def _example(folder: Path) -> int:
+    from corrmat.example import write
+
+    write(folder)
+    print(
+        f"{folder}: source.ply, target.ply and truth.json, two scans of one shape. Now try\n"
+        f"  corrmat register {folder / 'source.ply'} {folder / 'target.ply'} "
+        f"--html {folder / 'view.html'}"
+    )
+    return 0
+
+
 def _experiment(known: argparse.Namespace, options: list[str]) -> int:
     # Imported here, so that --help and mistakes do not wait for torch.
-    from corrmat import experiment, metrics, recipe
+    from corrmat import console, experiment, metrics, recipe
     from corrmat.methods import METHODS
 
     if known.help:
@@ -133,20 +251,26 @@ def _experiment(known: argparse.Namespace, options: list[str]) -> int:
             .split("\n\n", 1)[1]
         )
         return 0
+    if getattr(known, "models", None):
+        _refuse(options)
+        return _compare(known)
     if known.config is None:
         raise CorrmatError("which experiment? --config configs/exp/1.1.yaml")
     wanted = getattr(known, "arm", None)
     arms = [wanted] if wanted else None
     experiment.quieten()
+    console.listen(getattr(known, "verbose", False) - getattr(known, "quiet", False))
     found = recipe.load(known.config, known.scale, options, arms)
     if known.command == "run":
-        experiment.run(found, known.results, known.runs)
+        experiment.run(found, known.results, known.runs, known.logger)
         return 0
     name = next((arm for arm in found.settings if arm.endswith("_corr")), list(found.settings)[-1])
     arm = experiment.prepare(name, found.settings[name])
     folder = known.runs / found.scale / found.data / found.id / name
     if known.command == "fit":
-        trained = experiment.train(arm, folder, group=f"{found.scale}/{found.data}/{found.id}")
+        group = f"{found.scale}/{found.data}/{found.id}"
+        with console.Board() as board:
+            trained = experiment.train(arm, folder, group, known.logger, board)
         print(f"best checkpoint: {trained.checkpoint}")
         return 0
     checkpoint = known.checkpoint or experiment.best_checkpoint(found, name, known.runs)
@@ -157,6 +281,19 @@ def _experiment(known: argparse.Namespace, options: list[str]) -> int:
             print(f"\n{found.bands_deg[number]:g} to {found.bands_deg[number + 1]:g} deg")
         for name, value in metrics.summary(pairs).items():
             print(f"{name:28s} {value:.6g}")
+    return 0
+
+
+def _compare(known: argparse.Namespace) -> int:
+    from corrmat import comparison
+
+    of = {"protocol": known.protocol, "data": known.data, "points": known.points}
+    pairs = comparison.frozen_pairs(**of, root=known.root, count=known.pairs)
+    found = comparison.compare(pairs, known.models.split(","))
+    print(comparison.table(found))
+    if known.record is not None:
+        comparison.write(known.record, found, **of, pairs=len(pairs))
+        print(f"record: {known.record}")
     return 0
 
 
@@ -207,6 +344,7 @@ def _report(results: Path, output: Path | None, docs: Path | None) -> int:
         records = report.read_records(results, scale="laptop")
         pages = docs / "README.md", docs / "docs" / "reproduction.md"
         report.refresh(pages[0], "results", report.markdown_summary(records))
+        report.refresh(pages[0], "register", report.markdown_register(results))
         report.refresh(pages[1], "tables", report.markdown_tables(records))
         print(f"{len(records)} records -> {pages[0]}, {pages[1]}")
     return 0

@@ -1,10 +1,7 @@
 """A recipe becomes a record: arms trained, tested once on frozen pairs, written to results/."""
 
 import json
-import logging
-import os
 import shutil
-import sys
 import warnings
 import zlib
 from collections.abc import Sequence
@@ -17,13 +14,13 @@ import numpy as np
 import torch
 import yaml
 from lightning.fabric.utilities.exceptions import MisconfigurationException
-from lightning.pytorch.callbacks import Callback, ModelCheckpoint, TQDMProgressBar
-from lightning.pytorch.loggers import CSVLogger, Logger, WandbLogger
+from lightning.pytorch.callbacks import ModelCheckpoint
 from torch import Tensor
 
-from corrmat import record, report
+from corrmat import logs, record, report
 from corrmat.baselines import BASELINES, UNTRAINED
 from corrmat.callbacks import Curve, SaveOnInterrupt, say
+from corrmat.console import Board, Progress
 from corrmat.data.datamodule import RegistrationDataModule
 from corrmat.errors import CorrmatError
 from corrmat.files import replace_text
@@ -74,13 +71,14 @@ def prepare(name: str, settings: Settings) -> Arm:
     return arm
 
 
-def run(recipe: Recipe, results: Path, runs: Path) -> dict[str, Any]:
+def run(recipe: Recipe, results: Path, runs: Path, logger: logs.Choice = "csv") -> dict[str, Any]:
     """Train and test every arm, and write the record at one stroke when all are done.
 
     Args:
         recipe: the experiment.
         results: folder of records; this one goes to <scale>/<data>/<id>.
         runs: folder of checkpoints and logs, the same below it.
+        logger: see `logs.loggers`.
 
     Returns:
         The record, as in metrics.json.
@@ -88,20 +86,22 @@ def run(recipe: Recipe, results: Path, runs: Path) -> dict[str, Any]:
     place = Path(recipe.scale, recipe.data, recipe.id)
     ready = [prepare(name, settings) for name, settings in recipe.settings.items()]
     scores, rows, views = {}, [], []
-    for arm in ready:
-        say(f"\n{recipe.id} {arm.name} ({recipe.scale}, {recipe.data})")
-        folder = runs / place / arm.name
-        trained = _reusable(recipe, arm, runs) or train(arm, folder, group=str(place))
-        module = trained_module(arm, trained.checkpoint)
-        tests, scored = _tested(module, arm, recipe)
-        scores[arm.name] = scored | {
-            "pairs_seen": trained.pairs_seen,
-            "train_seconds": round(trained.train_seconds, 1),
-            "trained_at": trained.commit,
-            "curve": trained.curve,
-        }
-        rows += record.rows(arm.name, tests)
-        views = views or _views(module, arm, tests, recipe)
+    with Board() as board:
+        for arm in ready:
+            say(f"\n{recipe.id} {arm.name} ({recipe.scale}, {recipe.data})")
+            folder = runs / place / arm.name
+            trained = _reusable(recipe, arm, runs)
+            trained = trained or train(arm, folder, str(place), logger, board)
+            module = trained_module(arm, trained.checkpoint)
+            tests, scored = _tested(module, arm, recipe)
+            scores[arm.name] = scored | {
+                "pairs_seen": trained.pairs_seen,
+                "train_seconds": round(trained.train_seconds, 1),
+                "trained_at": trained.commit,
+                "curve": trained.curve,
+            }
+            rows += record.rows(arm.name, tests)
+            views = views or _views(module, arm, tests, recipe)
     baselines = {}
     for name in recipe.baselines:
         tests, baselines[name] = _tested(_baseline(name, ready[-1]), ready[-1], recipe)
@@ -123,18 +123,27 @@ def run(recipe: Recipe, results: Path, runs: Path) -> dict[str, Any]:
     for arm in ready:
         if (runs / place / arm.name).is_dir():
             (runs / place / arm.name / RECORDED).touch()
-    say(report.terminal_table(found))
+    logs.send_record(logger, runs / place, found, views, results / place)
+    print(report.terminal_table(found), flush=True)
     say(f"record: {results / place}")
     return found
 
 
-def train(arm: Arm, folder: Path, group: str = "") -> Trained:
+def train(
+    arm: Arm,
+    folder: Path,
+    group: str = "",
+    logger: logs.Choice = "csv",
+    board: Board | None = None,
+) -> Trained:
     """Train one arm; goes on from an interrupted run of the same settings if there is one.
 
     Args:
         arm: from `prepare`.
         folder: for checkpoints (best.ckpt on validation, last.ckpt) and logs.
         group: wandb's name for the arms that belong together.
+        logger: see `logs.loggers`.
+        board: to show progress on.
 
     Raises:
         CorrmatError: a loss that is no longer a number.
@@ -160,8 +169,12 @@ def train(arm: Arm, folder: Path, group: str = "") -> Trained:
         ModelCheckpoint(folder, "best", monitor=BEST, enable_version_counter=False),
         ModelCheckpoint(folder, "last", enable_version_counter=False),
         SaveOnInterrupt(last),
+        *([Progress(board, arm.name, curve)] if board else []),
     ]
-    trainer = make_trainer(settings, folder, callbacks, arm.name, group)
+    config = report.plain(settings.as_dict())
+    made = logs.loggers(logger, folder, arm.name, group, config)
+    options = trainer_options(settings)
+    trainer = L.Trainer(**options, logger=made, callbacks=callbacks, default_root_dir=folder)
     try:
         trainer.fit(module, datamodule, ckpt_path=last if resume else None, weights_only=True)
     except CorrmatError as error:
@@ -169,9 +182,7 @@ def train(arm: Arm, folder: Path, group: str = "") -> Trained:
         raise CorrmatError(
             f"{error}; seed {settings.seed}; last good checkpoint: {kept}"
         ) from error
-    for logger in trainer.loggers:
-        if isinstance(logger, WandbLogger):
-            logger.experiment.finish()
+    logs.finish(made)
     checkpoint = folder / "best.ckpt"
     if not checkpoint.is_file():
         say("training ended before the first validation: the last weights stand for the best")
@@ -323,8 +334,6 @@ def load_weights(module: RegistrationModule, checkpoint: Path) -> None:
 
 def quieten() -> None:
     """Keep Lightning's hints and the deprecations inside libraries off the user's screen."""
-    for name in ("lightning.pytorch", "lightning.fabric"):
-        logging.getLogger(name).setLevel(logging.WARNING)
     for message in (
         "isinstance.treespec, LeafSpec",
         "Checkpoint directory",  # ours holds the logs already
@@ -334,28 +343,11 @@ def quieten() -> None:
         warnings.filterwarnings("ignore", message=f".*{message}")
 
 
-def make_trainer(
-    settings: Settings, folder: Path, callbacks: list[Callback], arm: str, group: str
-) -> L.Trainer:
-    """A Trainer with our loggers and callbacks; a progress bar where somebody watches."""
-    options = trainer_options(settings)
-    if options.get("enable_progress_bar") is None:
-        options["enable_progress_bar"] = sys.stderr.isatty()
-    if options["enable_progress_bar"]:
-        callbacks = [*callbacks, TQDMProgressBar(refresh_rate=5)]
-    loggers: list[Logger] = [CSVLogger(folder, name="csv")]
-    mode = os.environ.get("WANDB_MODE", "offline")
-    if mode != "disabled":
-        loggers.append(_wandb(folder, arm, group, mode, settings))
-    return L.Trainer(
-        **options, logger=loggers, callbacks=callbacks, default_root_dir=folder,
-    )  # fmt: skip
-
-
 def trainer_options(settings: Settings) -> dict[str, Any]:
     """Keyword arguments of Lightning's Trainer."""
     options = settings.trainer.as_dict()
     options |= {"enable_model_summary": False, "enable_checkpointing": True}
+    options["enable_progress_bar"] = bool(options.get("enable_progress_bar"))  # ours is the board
     if options["accelerator"] == "auto" and torch.backends.mps.is_available():
         options["accelerator"] = "cpu"  # Apple's GPUs lack the float64 that Procrustes needs
     return options
@@ -380,24 +372,6 @@ def _progress(checkpoint: Path, datamodule: RegistrationDataModule) -> dict[str,
     seen = content["loops"]["fit_loop"]["epoch_loop.batch_progress"]["current"]["completed"]
     seen %= len(datamodule.train_dataloader())  # a whole epoch seen: the next one is whole too
     return {"epoch": content["epoch"], "done": seen * datamodule.batch_size}
-
-
-def _wandb(folder: Path, arm: str, group: str, mode: str, settings: Settings) -> WandbLogger:
-    import wandb  # starts slowly, and not everybody wants it
-
-    run = wandb.init(
-        project="corrmat",
-        name=f"{group}/{arm}",
-        group=group,
-        job_type=arm,
-        dir=folder,
-        mode="online" if mode == "online" else "offline",
-        config=report.plain(settings.as_dict()),
-        settings=wandb.Settings(
-            silent=True, console="off", disable_git=True, save_code=False, x_disable_stats=True
-        ),
-    )
-    return WandbLogger(experiment=run)
 
 
 def _reusable(recipe: Recipe, arm: Arm, runs: Path) -> Trained | None:

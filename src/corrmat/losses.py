@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from corrmat.ops import rigid
-from corrmat.ops.correspondence import SoftCorrespondence
+from corrmat.ops.correspondence import MatchabilityCorrespondence, SoftCorrespondence
 from corrmat.ops.neighbors import nearest, take
 from corrmat.types import PairBatch, Prediction
 
@@ -87,6 +87,35 @@ def chamfer_loss(moved: Tensor, target: Tensor) -> Tensor:
     return there.norm(dim=-1).mean() + back.norm(dim=-1).mean()
 
 
+def mutual_matches(moved: Tensor, target: Tensor, reach: float) -> tuple[Tensor, Tensor]:
+    """Matches of two clouds that share no point: nearest to each other, and near.
+
+    Args:
+        moved: (B, N, 3) source, where it truly lies.
+        target: (B, M, 3).
+        reach: beyond it, no match.
+
+    Returns:
+        Classes (B, N) of source points and (B, M) of target points: the index of the match; M
+        (or N) where nothing is in reach; -1, no class, where something is but prefers another.
+    """
+    there, back = nearest(moved, target), nearest(target, moved)
+
+    def classes(own: Tensor, cloud: Tensor, to: Tensor, fro: Tensor) -> Tensor:
+        near = (own - take(cloud, to)).norm(dim=-1) <= reach
+        mutual = fro.gather(1, to) == torch.arange(to.shape[1], device=to.device)
+        return torch.where(near, torch.where(mutual, to, -1), cloud.shape[1])
+
+    return classes(moved, target, there, back), classes(target, moved, back, there)
+
+
+def mutual_loss(c: MatchabilityCorrespondence, matches: tuple[Tensor, Tensor]) -> Tensor:
+    """Cross-entropy over the rows and over the columns of C, as `mutual_matches` labels them."""
+    return (
+        correspondence_loss(c, matches[0]) + correspondence_loss(c.transposed(), matches[1])
+    ) / 2
+
+
 def discounted(losses: Sequence[Tensor]) -> Tensor:
     """Sum over the turns of an iterative network, each worth half the next (RPM-Net)."""
     total = losses[0]
@@ -114,6 +143,22 @@ class CorrespondenceLoss:
         if None in found:
             raise ValueError("this network predicts no correspondence to train on")
         return discounted([correspondence_loss(c, batch.match) for c in found if c is not None])
+
+
+class MutualLoss:
+    """Train on the correspondence matrix of two clouds of which each lacks parts of the other."""
+
+    reach = 0.08  # about the distance of neighbours among 512 points of a unit ball's shape
+
+    def loss(self, prediction: Prediction, batch: PairBatch) -> Tensor:
+        """`mutual_loss` of a batch, `discounted` over the layers."""
+        found = [step.correspondence for step in prediction.steps]
+        moved = rigid.apply(batch.rotation, batch.translation, batch.source[..., :3])
+        matches = mutual_matches(moved, batch.target[..., :3], self.reach)
+        known = [c for c in found if isinstance(c, MatchabilityCorrespondence)]
+        if len(known) < len(found):
+            raise ValueError("this network has no doubt about target points to train")
+        return discounted([mutual_loss(c, matches) for c in known])
 
 
 class RegistrationLoss:

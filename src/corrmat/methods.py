@@ -7,11 +7,13 @@ from torch import nn
 from corrmat.losses import (
     ChamferLoss,
     CorrespondenceLoss,
+    MutualLoss,
     RegistrationLoss,
     TransformationLoss,
 )
 from corrmat.module import OptimizerSettings, RegistrationModule
 from corrmat.networks.dcp import DCPNetwork
+from corrmat.networks.invariant import InvariantNetwork
 from corrmat.networks.pcrnet import PCRNetCorrNetwork, PCRNetwork
 from corrmat.networks.rpmnet import RPMNetwork
 
@@ -70,6 +72,13 @@ class PCRNetCorr(CorrespondenceLoss, Method):
     paper_optimizer = OptimizerSettings(1e-3, 1e-4, milestones=(75, 150, 200), gamma=0.1)
 
 
+class InvariantCorr(MutualLoss, Method):
+    """What `corrmat register` ships: no network of the paper, but its loss."""
+
+    network_type = InvariantNetwork
+    paper_optimizer = OptimizerSettings(1e-3, 0.0, schedule="onecycle")
+
+
 METHODS: dict[str, type[Method]] = {
     "DCP": DCP,
     "DCP_corr": DCPCorr,
@@ -77,4 +86,5 @@ METHODS: dict[str, type[Method]] = {
     "RPMNet_corr": RPMNetCorr,
     "PCRNet": PCRNet,
     "PCRNet_corr": PCRNetCorr,
+    "Invariant_corr": InvariantCorr,
 }

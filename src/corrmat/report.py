@@ -137,6 +137,25 @@ def markdown_tables(records: Sequence[Mapping[str, Any]]) -> str:
     return "\n".join(parts).rstrip()
 
 
+def markdown_register(results: Path) -> str:
+    """The README's table of `corrmat register`: a row a set of pairs, a column a model."""
+    records = [json.loads(path.read_text()) for path in sorted(results.glob("register/*-*.json"))]
+    if not records:
+        return "No comparison is recorded; `make protocols` makes them."
+    models = list(records[0]["models"])
+    heads = ["pairs", "data", "points", *models]
+    lines = [_row(heads), "|" + "---|" * len(heads)]
+    for record in sorted(records, key=lambda r: (r["protocol"] != "real", r["data"], r["points"])):
+        found = [record["models"].get(model) for model in models]
+        cells = [
+            "" if f is None
+            else f"{f['recall_5deg']:.0%} / {f['recall_adds']:.0%}, {f['ms']:.0f} ms"
+            for f in found
+        ]  # fmt: skip
+        lines.append(_row([record["protocol"], record["data"], str(record["points"]), *cells]))
+    return "\n".join(lines)
+
+
 def read_records(results: Path, scale: str = "*") -> list[dict[str, Any]]:
     """Every record below a folder, ordered by scale, experiment and data."""
     found = results.glob(f"{scale}/*/*/metrics.json")

@@ -1,13 +1,24 @@
-"""Checkpoints of the original authors, under the names that this project gives their layers."""
+"""Trained networks: the shipped one, this project's checkpoints, and the original authors'.
 
+Nothing here executes what a file says: tensors are read by safetensors or by torch's loader for
+weights only, which refuses every other kind of object.
+"""
+
+import json
+import pickle
 import re
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
+import safetensors
+import safetensors.torch
 import torch
+import yaml
 from torch import Tensor, nn
 
 from corrmat.errors import CorrmatError
+from corrmat.methods import METHODS
 from corrmat.networks.dcp import DCPNetwork
 from corrmat.networks.pcrnet import PCRNetCorrNetwork, PCRNetwork
 from corrmat.networks.rpmnet import RPMNetwork
@@ -80,6 +91,93 @@ def load_reference(kind: str, state_dict: Mapping[str, Any], **hparams: Any) -> 
         if name not in _LEFT_OUT
     }
     return _filled(_BUILD[kind](ours, hparams), ours)
+
+
+SHIPPED = Path(__file__).parent / "shipped" / "corrmat.safetensors"
+
+
+def load_model(model: str | Path = "corrmat") -> nn.Module:
+    """A trained network, in evaluation mode.
+
+    Args:
+        model: "corrmat" for the weights that ship with the package; or a file: a checkpoint of
+            `corrmat fit` (with its settings.yaml beside it), or the original authors' .t7 or
+            .pth of DCP, RPMNet, PCRNet or PCRNet_corr.
+
+    Raises:
+        CorrmatError: there is no such file, it holds anything but tensors, or they fit no
+            network; the message says which do not.
+    """
+    if str(model) == "corrmat":
+        about = shipped_about()
+        network = METHODS[about["method"]].network_type(**json.loads(about["network"]))
+        return _filled(network, safetensors.torch.load_file(SHIPPED))
+    path = Path(model)
+    state = _tensors(path)
+    if all(name.startswith("network.") for name in state):
+        return own_checkpoint(path)[2]
+    return load_reference(_kind_of(path, state), state)
+
+
+def shipped_about() -> dict[str, str]:
+    """What the shipped weights say of themselves: method, network, commit, calibration."""
+    with safetensors.safe_open(SHIPPED, framework="pt") as file:
+        return file.metadata()
+
+
+def _tensors(path: Path) -> State:
+    if not path.is_file():
+        raise CorrmatError(
+            f"no model {str(path)!r}: neither corrmat, icp, ransac, fgr nor a checkpoint file"
+        )
+    try:
+        found = torch.load(path, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        raise CorrmatError(
+            f"{path} is no checkpoint of tensors alone; nothing else is ever loaded"
+        ) from error
+    except (RuntimeError, EOFError, OSError, ValueError, KeyError) as error:
+        raise CorrmatError(f"{path} is no checkpoint, or cut short") from error
+    for key in ("state_dict", "model", "model_state_dict"):
+        if isinstance(found, Mapping) and isinstance(found.get(key), Mapping):
+            found = found[key]
+    if not isinstance(found, Mapping) or not found:
+        raise CorrmatError(f"{path} holds no parameters by name")
+    tensors = {str(k): v for k, v in found.items() if isinstance(v, Tensor)}
+    return {name.removeprefix("module."): value for name, value in tensors.items()}
+
+
+def own_checkpoint(path: Path) -> tuple[str, dict[str, Any], nn.Module]:
+    """Method, hyper-parameters and network of a checkpoint of `corrmat fit`.
+
+    Raises:
+        CorrmatError: settings.yaml is not beside it, or it does not fit.
+    """
+    settings = path.parent / "settings.yaml"
+    if not settings.is_file():
+        raise CorrmatError(f"{path} is a checkpoint of corrmat, but {settings} is not beside it")
+    about = yaml.safe_load(settings.read_text())
+    method, hparams = about["method"], about["network"]
+    own = {
+        name.removeprefix("network."): value
+        for name, value in _tensors(path).items()
+        if name.startswith("network.")
+    }
+    return method, hparams, _filled(METHODS[method].network_type(**hparams), own)
+
+
+def _kind_of(path: Path, state: State) -> str:
+    if "feat_extractor.prepool.0.weight" in state:
+        return "rpmnet"
+    if "feature_model.conv1.weight" in state:
+        return "pcrnet"
+    first = state.get("emb_nn.conv1.weight")
+    if first is not None:
+        return "dcp" if first.shape[1] == 6 else "pcrnet_corr"
+    names = ", ".join(sorted(state)[:4])
+    raise CorrmatError(
+        f"{path} is none of DCP, RPMNet, PCRNet and PCRNet_corr; its parameters: {names}, ..."
+    )
 
 
 def rename(kind: str, name: str) -> str:

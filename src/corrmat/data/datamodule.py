@@ -80,6 +80,9 @@ class RegistrationDataModule(L.LightningDataModule):
         jitter: noise on the coordinates.
         outliers: share of source points replaced.
         outlier_distance: from where on a source point counts as an outlier.
+        spoilt: which clouds are cropped and get outliers.
+        normals: where they come from.
+        stretch: how far training shapes are drawn out along their axes; never test shapes.
         batch_size: pairs a batch.
         categories: only these; all by default.
         train_shapes: only the first so many training shapes (10 % of them held out).
@@ -102,6 +105,9 @@ class RegistrationDataModule(L.LightningDataModule):
         jitter: float = 0.0,
         outliers: float = 0.0,
         outlier_distance: float = 0.05,
+        spoilt: Literal["source", "both"] = "source",
+        normals: Literal["given", "estimated"] = "given",
+        stretch: float = 1.0,
         batch_size: int = 16,
         categories: list[str] | None = None,
         train_shapes: int | None = None,
@@ -112,7 +118,7 @@ class RegistrationDataModule(L.LightningDataModule):
         super().__init__()
         self.how = PairSettings(
             num_points, rotation_deg, min_rotation_deg, translation, keep, sampling, jitter,
-            outliers, outlier_distance,
+            outliers, outlier_distance, spoilt, normals, stretch,
         )  # fmt: skip
         self.data, self.root, self.categories = data, root, categories
         self.counts = {"train": train_shapes, "test": test_shapes}
@@ -155,11 +161,11 @@ class RegistrationDataModule(L.LightningDataModule):
 
     def val_dataloader(self) -> DataLoader[PairBatch]:
         """One frozen pair of each held-out training shape."""
-        return self._loader("val", self.how)
+        return self._loader("val", replace(self.how, stretch=1.0))
 
     def test_dataloader(self, **changes: float) -> DataLoader[PairBatch]:
         """One frozen pair of each test shape; `changes` replace fields of PairSettings."""
-        return self._loader("test", replace(self.how, **changes))
+        return self._loader("test", replace(self.how, stretch=1.0, **changes))
 
     def _loader(self, split: Split, how: PairSettings) -> DataLoader[PairBatch]:
         dataset = PairDataset(self.clouds(split), how, self.seed, split)

@@ -15,6 +15,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from corrmat.data.clouds import CloudSet
+from corrmat.data.normals import estimate
 from corrmat.errors import CorrmatError
 from corrmat.ops import rigid
 from corrmat.types import PairBatch
@@ -43,6 +44,12 @@ class PairSettings:
             point is labelled an outlier. Inliers of identical sampling lie at 0, and a
             random point of the cube lies nearer than this to a surface only where it
             might as well be a surface point.
+        spoilt: which clouds are cropped and get outliers. With "both", a source point whose
+            surface the target lacks is labelled an outlier too.
+        normals: "given" with the clean cloud, or "estimated" from each spoilt one.
+        stretch: every axis of a shape is drawn out by a factor of up to this and at least its
+            inverse, and half of the shapes are mirrored: other shapes of the same kind, for
+            training. 1 leaves them alone; only with estimated normals.
     """
 
     num_points: int = 512
@@ -54,6 +61,9 @@ class PairSettings:
     jitter: float = 0.0
     outliers: float = 0.0
     outlier_distance: float = 0.05
+    spoilt: Literal["source", "both"] = "source"
+    normals: Literal["given", "estimated"] = "given"
+    stretch: float = 1.0
 
     def __post_init__(self) -> None:
         checks = {
@@ -65,6 +75,7 @@ class PairSettings:
             "jitter": self.jitter >= 0,
             "outliers": 0 <= self.outliers < 1,
             "outlier_distance": self.outlier_distance > 0,
+            "stretch": self.stretch == 1 or (self.stretch > 1 and self.normals == "estimated"),
         }
         for name, fine in checks.items():
             if not fine:
@@ -74,6 +85,11 @@ class PairSettings:
     def num_source(self) -> int:
         """Points of the source after the crop: round(keep * N)."""
         return round(self.keep * self.num_points)
+
+    @property
+    def unmatched(self) -> bool:
+        """Whether a source point may have no match."""
+        return bool(self.outliers) or self.spoilt == "both"
 
 
 class Key(NamedTuple):
@@ -98,6 +114,10 @@ class _Draw(NamedTuple):
     noise: np.ndarray  # (n + N, 3) Gaussian
     outlier: np.ndarray  # (round(outliers * n),) which source points
     outlier_at: np.ndarray  # (..., 6) what they become
+    target_plane: np.ndarray  # (3,) Gaussian: direction of the target's crop plane
+    target_outlier: np.ndarray  # as outlier and outlier_at, where both clouds are spoilt
+    target_outlier_at: np.ndarray
+    stretch: np.ndarray  # (4,) in [0, 1): factors of the axes, mirror
 
 
 def make_pairs(
@@ -117,24 +137,35 @@ def make_pairs(
     size = clouds.rows.shape[1]
     draws = [_draw(how, size, key) for key in keys]
     source_index, target_index = _stack(draws, "source"), _stack(draws, "target")
-    source = _gather(clouds, shapes, source_index)
-    target = _gather(clouds, shapes, target_index)
+    clean = clouds.rows[list(shapes)]
+    if how.stretch > 1:
+        clean = _stretched(clean, _stack(draws, "stretch"), how.stretch)
+    source = np.take_along_axis(clean, source_index[..., None], 1)
+    target = np.take_along_axis(clean, target_index[..., None], 1)
 
     if how.num_source < how.num_points:
         kept = _crop(source[..., :3], _stack(draws, "normal")[:, 1], how.num_source)
         source = np.take_along_axis(source, kept[..., None], 1)
         source_index = np.take_along_axis(source_index, kept, 1)
+        if how.spoilt == "both":
+            kept = _crop(target[..., :3], _stack(draws, "target_plane"), how.num_source)
+            target = np.take_along_axis(target, kept[..., None], 1)
     if how.outliers:
         batch = np.arange(len(draws))[:, None]
         source[batch, _stack(draws, "outlier")] = _stack(draws, "outlier_at")
-    if how.sampling == "identical" and not how.outliers:
+        if how.spoilt == "both":
+            target[batch, _stack(draws, "target_outlier")] = _stack(draws, "target_outlier_at")
+    if how.sampling == "identical" and not how.unmatched:
         match = _same_points(source_index, target_index, size)
     else:
         match = _nearest(source[..., :3], target[..., :3], how)
     if how.jitter:
         noise = how.jitter * _stack(draws, "noise")
         source[..., :3] += noise[:, : how.num_source]
-        target[..., :3] += noise[:, how.num_source :]
+        target[..., :3] += noise[:, how.num_source :][:, : target.shape[1]]
+    if how.normals == "estimated":
+        for cloud in (*source, *target):
+            cloud[:, 3:] = estimate(cloud[:, :3])
 
     rotation, translation = _motion(_stack(draws, "normal")[:, 0], _stack(draws, "uniform"), how)
     # Points and normals turn alike: (B, 2N, 3) for the product, translation for points only.
@@ -147,7 +178,7 @@ def make_pairs(
         rotation=rotation,
         translation=translation,
         match=torch.from_numpy(match),
-        clean=torch.from_numpy(clouds.rows[list(shapes)])[..., :3],
+        clean=torch.from_numpy(clean)[..., :3],
         shape=torch.as_tensor(shapes, dtype=torch.int64),
     )
 
@@ -174,12 +205,26 @@ def _draw(how: PairSettings, size: int, key: Key) -> _Draw:
         target = rng.choice(left, n, replace=False)
     outlier = outlier_at = noise = _NOTHING
     if how.outliers:
-        outlier = rng.choice(kept, round(how.outliers * kept), replace=False)
-        outlier_at = rng.random((len(outlier), 6), np.float32) - np.float32(0.5)
-        outlier_at[:, 3:] /= np.linalg.norm(outlier_at[:, 3:], axis=1, keepdims=True)
+        outlier, outlier_at = _outliers(rng, how)
     if how.jitter:
         noise = rng.standard_normal((kept + n, 3), np.float32)
-    return _Draw(source, target, normal, uniform, noise, outlier, outlier_at)
+    target_plane = target_outlier = target_outlier_at = _NOTHING
+    if how.spoilt == "both":
+        target_plane = rng.standard_normal(3)
+        target_outlier, target_outlier_at = _outliers(rng, how)
+    stretch = rng.random(4) if how.stretch > 1 else _NOTHING
+    return _Draw(
+        source, target, normal, uniform, noise, outlier, outlier_at,
+        target_plane, target_outlier, target_outlier_at, stretch,
+    )  # fmt: skip
+
+
+def _outliers(rng: np.random.Generator, how: PairSettings) -> tuple[np.ndarray, np.ndarray]:
+    """Which points are replaced, and the points and normals they become."""
+    chosen = rng.choice(how.num_source, round(how.outliers * how.num_source), replace=False)
+    at = rng.random((len(chosen), 6), np.float32) - np.float32(0.5)
+    at[:, 3:] /= np.linalg.norm(at[:, 3:], axis=1, keepdims=True)
+    return chosen, at
 
 
 def _motion(axis: np.ndarray, uniform: np.ndarray, how: PairSettings) -> tuple[Tensor, Tensor]:
@@ -192,8 +237,13 @@ def _motion(axis: np.ndarray, uniform: np.ndarray, how: PairSettings) -> tuple[T
     return rotation.float(), torch.from_numpy(translation).float()
 
 
-def _gather(clouds: CloudSet, shapes: Sequence[int], index: np.ndarray) -> np.ndarray:
-    return np.stack([clouds.rows[s].take(i, axis=0) for s, i in zip(shapes, index, strict=True)])
+def _stretched(rows: np.ndarray, uniform: np.ndarray, most: float) -> np.ndarray:
+    """Clouds (B, P, 6) drawn out along their axes, back in the unit sphere; normals are lost."""
+    factor = most ** (2 * uniform[:, :3] - 1)
+    factor[:, 0] *= np.where(uniform[:, 3] < 0.5, 1, -1)
+    points = rows[..., :3] * factor[:, None]
+    points /= np.linalg.norm(points, axis=-1).max(1)[:, None, None]
+    return np.concatenate([points, np.zeros_like(points)], -1).astype(np.float32)
 
 
 def _crop(points: np.ndarray, plane: np.ndarray, keep: int) -> np.ndarray:
@@ -212,7 +262,7 @@ def _same_points(source: np.ndarray, target: np.ndarray, size: int) -> np.ndarra
 
 def _nearest(source: np.ndarray, target: np.ndarray, how: PairSettings) -> np.ndarray:
     """The nearest target point of each source point; M where outliers may be and none is near."""
-    reach = how.outlier_distance if how.outliers else np.inf
+    reach = how.outlier_distance if how.unmatched else np.inf
     pairs = zip(source, target, strict=True)
     found = [KDTree(y).query(x, distance_upper_bound=reach)[1] for x, y in pairs]
     return np.stack(found).astype(np.int64)

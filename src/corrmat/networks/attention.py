@@ -84,8 +84,8 @@ class Attention(nn.Module):
 class FeedForward(nn.Sequential):
     """Linear, ReLU, linear."""
 
-    def __init__(self, width: int, hidden: int) -> None:
-        super().__init__(nn.Linear(width, hidden), nn.ReLU(), nn.Linear(hidden, width))
+    def __init__(self, width: int, hidden: int, out: int | None = None) -> None:
+        super().__init__(nn.Linear(width, hidden), nn.ReLU(), nn.Linear(hidden, out or width))
 
 
 class StdNorm(nn.Module):

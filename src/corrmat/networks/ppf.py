@@ -1,5 +1,6 @@
 """Point-pair features: a neighbourhood as it looks from any side (RPM-Net, section 5.1)."""
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -63,3 +64,34 @@ def point_pair_features(offset: Tensor, normal: Tensor, neighbor_normal: Tensor)
 def _angle_rad(a: Tensor, b: Tensor) -> Tensor:
     cross, dot = torch.linalg.cross(a, b), (a * b).sum(-1)
     return torch.atan2(cross.norm(dim=-1), dot)
+
+
+SIGNLESS = 13  # numbers that `signless_pair_features` gives
+_LENGTHS = (0.05, 0.1, 0.17, 0.27, 0.42, 0.65, 1.0, 1.6)
+
+
+def signless_pair_features(offset: Tensor, normal: Tensor, neighbor_normal: Tensor) -> Tensor:
+    """Pair features that stay as they are when either normal is turned over.
+
+    Eight bumps over the distance, one at each of a growing row of lengths; |n_r . d|, |n_i . d|
+    and |n_r . n_i| for the unit offset d; and two products in which every normal comes twice:
+    (n_r . d)(n_i . d)(n_r . n_i), which tells a bulge from a dent, and (n_r x n_i . d)(n_r . n_i),
+    which changes its sign in a mirror and so tells left from right.
+
+    Args:
+        offset: (..., 3), neighbour minus centre.
+        normal: n_r, (..., 3), unit normal at the centre.
+        neighbor_normal: n_i, (..., 3), unit normal at the neighbour.
+
+    Returns:
+        (..., 13), each of order one.
+    """
+    # Coordinates first: sums over a last dimension of three are several times slower.
+    x, n, m = (t.movedim(-1, 0).contiguous() for t in (offset, normal, neighbor_normal))
+    distance = x.square().sum(0).sqrt().clamp_min(1e-6)
+    d = x / distance
+    a, b, c = (n * d).sum(0), (m * d).sum(0), (n * m).sum(0)
+    turn = (torch.linalg.cross(*torch.broadcast_tensors(n, m), dim=0) * d).sum(0)
+    log = distance.log()
+    bumps = [torch.exp(-((log - math.log(at)) / 0.45).square()) for at in _LENGTHS]
+    return torch.stack([*bumps, a.abs(), b.abs(), c.abs(), a * b * c, turn * c], -1)

@@ -1,0 +1,112 @@
+"""Anybody's clouds and meshes: files in, points out, and back."""
+
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from corrmat.errors import CorrmatError
+from corrmat.files import replace_bytes
+
+MESHES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
+CLOUDS = (".pcd", ".xyz", ".txt", ".csv", ".npy", ".npz")
+SAMPLES = 20_000  # points taken of a mesh's surface
+
+
+def read_scan(path: Path, seed: int = 0) -> np.ndarray:
+    """The points of a file, (N, 3) float64 in its own units; a mesh is sampled evenly.
+
+    Parts of a scene are merged, colours and all else are left out. What the points are is not
+    judged here.
+
+    Args:
+        path: PLY, OBJ, STL, OFF, GLB or GLTF; PCD, XYZ, TXT, CSV, NPY or NPZ.
+        seed: of the samples on a mesh.
+
+    Raises:
+        CorrmatError: the file is missing, empty, of another format, or cut short.
+    """
+    kind = path.suffix.lower()
+    if kind not in MESHES + CLOUDS:
+        known = ", ".join(name[1:] for name in MESHES + CLOUDS)
+        raise CorrmatError(f"{path}: format {kind or 'without a suffix'} unknown; known: {known}")
+    if not path.is_file():
+        raise CorrmatError(f"{path}: no such file")
+    if not path.stat().st_size:
+        raise CorrmatError(f"{path} is empty")
+    reader = {".pcd": _pcd, ".npy": _numpy, ".npz": _numpy}.get(kind)
+    reader = reader or (_scene if kind in MESHES else _text)
+    try:
+        points = reader(path, seed)
+    except CorrmatError:
+        raise
+    # Readers of damaged files fail in every way there is; each means the same to the user.
+    except Exception as error:
+        said = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise CorrmatError(f"{path} cannot be read as {kind[1:].upper()} ({said})") from error
+    if points.ndim != 2 or points.shape[1] < 3:
+        raise CorrmatError(f"{path} holds an array of shape {points.shape}, not points (N, 3)")
+    if not len(points):
+        raise CorrmatError(f"{path} holds no points")
+    return np.ascontiguousarray(points[:, :3], np.float64)
+
+
+def write_ply(path: Path, points: np.ndarray) -> None:
+    """Points (N, 3) as a binary PLY of doubles: coordinates far from the origin keep their detail.
+
+    Raises:
+        CorrmatError: there is no such folder.
+    """
+    if not path.parent.is_dir():
+        raise CorrmatError(f"no folder {path.parent} to write {path.name} into")
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(points)}",
+        *(f"property double {axis}" for axis in "xyz"),
+        "end_header\n",
+    ]
+    replace_bytes(path, "\n".join(header).encode() + points.astype("<f8").tobytes())
+
+
+def _scene(path: Path, seed: int) -> np.ndarray:
+    loaded = trimesh.load(path)
+    parts = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
+    meshes = [p for p in parts if isinstance(p, trimesh.Trimesh) and len(p.faces) and p.area > 0]
+    if meshes:
+        whole = trimesh.util.concatenate(meshes)
+        return trimesh.sample.sample_surface(whole, SAMPLES, seed=seed)[0]
+    clouds = (trimesh.PointCloud, trimesh.Trimesh)
+    points = [np.asarray(p.vertices) for p in parts if isinstance(p, clouds)]
+    return np.concatenate([p.reshape(-1, 3) for p in points]) if points else np.empty((0, 3))
+
+
+def _pcd(path: Path, seed: int) -> np.ndarray:
+    from pypcd4.pypcd4 import PointCloud
+
+    cloud = PointCloud.from_path(path)
+    return cloud.numpy(("x", "y", "z"))
+
+
+def _numpy(path: Path, seed: int) -> np.ndarray:
+    found = np.load(path, allow_pickle=False)
+    if isinstance(found, np.ndarray):
+        return found
+    with found:
+        names = [n for n in found.files if found[n].ndim == 2 and found[n].shape[1] >= 3]
+        if len(names) != 1:
+            raise CorrmatError(
+                f"{path} holds {len(names)} arrays of points (N, 3), not one: {found.files}"
+            )
+        return found[names[0]]
+
+
+def _text(path: Path, seed: int) -> np.ndarray:
+    lines = path.read_text().replace(",", " ").splitlines()
+    rows = [line.split() for line in lines if line.strip() and not line.lstrip().startswith("#")]
+    if rows and len(rows[0]) == 1 and rows[0][0].isdigit():  # an XYZ file's count of points
+        rows = rows[1:]
+    short = next((i for i, row in enumerate(rows) if len(row) < 3), None)
+    if short is not None:
+        raise CorrmatError(f"{path}: row {short + 1} holds {len(rows[short])} numbers, not 3")
+    return np.array([row[:3] for row in rows], np.float64).reshape(-1, 3)

@@ -1,0 +1,122 @@
+"""Files of anybody's clouds: every format gives the same points, a damaged file one clear line."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from corrmat.data.scans import CLOUDS, MESHES, read_scan, write_ply
+from corrmat.errors import CorrmatError
+
+POINTS = np.random.default_rng(0).normal(size=(40, 3)) * 100
+
+
+def write(path, points=POINTS):
+    kind = path.suffix
+    if kind == ".ply":
+        write_ply(path, points)
+    elif kind == ".pcd":
+        from pypcd4 import PointCloud
+
+        PointCloud.from_xyz_points(points.astype(np.float32)).save(path)
+    elif kind == ".npy":
+        np.save(path, points)
+    elif kind == ".npz":
+        np.savez(path, cloud=points, label=np.arange(3))
+    else:
+        separator = "," if kind == ".csv" else " "
+        lines = [separator.join(repr(float(value)) for value in row) for row in points]
+        path.write_text("\n".join(["# a comment", *lines]) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("kind", [".ply", *CLOUDS])
+def test_every_cloud_format_gives_its_points(tmp_path, kind):
+    found = read_scan(write(tmp_path / f"cloud{kind}"))
+    assert found.dtype == np.float64
+    assert np.abs(found - POINTS).max() < (1e-4 if kind == ".pcd" else 1e-12)
+
+
+@pytest.mark.parametrize("kind", [k for k in MESHES if k != ".gltf"])
+def test_a_mesh_is_sampled_evenly_and_by_seed(tmp_path, kind):
+    path = tmp_path / f"box{kind}"
+    trimesh.creation.box((2, 2, 2)).export(path)
+    found = read_scan(path, seed=1)
+    assert found.shape == (20_000, 3)
+    assert np.allclose(np.abs(found).max(1), 1, atol=1e-6)  # all on the surface
+    assert np.abs(found.mean(0)).max() < 0.03
+    assert (read_scan(path, seed=1) == found).all()
+    assert (read_scan(path, seed=2) != found).any()
+
+
+def test_parts_of_a_scene_are_merged(tmp_path):
+    boxes = [trimesh.creation.box((1, 1, 1)).apply_translation((x, 0, 0)) for x in (0, 10)]
+    trimesh.Scene(boxes).export(tmp_path / "scene.glb")
+    found = read_scan(tmp_path / "scene.glb")
+    assert abs((found[:, 0] > 5).mean() - 0.5) < 0.02
+
+
+def test_an_xyz_file_may_begin_with_its_count_and_carry_more_columns(tmp_path):
+    path = tmp_path / "cloud.xyz"
+    path.write_text("2\n1 2 3 255 0 0\n4 5 6 0 255 0\n")
+    assert read_scan(path).tolist() == [[1, 2, 3], [4, 5, 6]]
+
+
+def test_a_ply_keeps_millimetres_at_ten_thousand_kilometres(tmp_path):
+    far = POINTS + 1e7
+    write_ply(tmp_path / "far.ply", far)
+    assert (read_scan(tmp_path / "far.ply") == far).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("none.ply", None, "no such file"),
+        ("cloud.docx", b"x", "format .docx unknown"),
+        ("cloud", b"x", "without a suffix"),
+        ("empty.ply", b"", "is empty"),
+        ("empty.xyz", b"\n\n", "holds no points"),
+        ("words.txt", b"one two three\n", "cannot be read as TXT"),
+        ("short.txt", b"1 2 3\n4 5\n", "row 2 holds 2 numbers"),
+        ("noise.npy", b"\x93NUMPY nonsense", "cannot be read as NPY"),
+        ("noise.stl", b"solid nothing", "holds no points"),
+        ("noise.pcd", b"VERSION .7\n", "cannot be read as PCD"),
+        ("noise.glb", b"glTF....", "cannot be read as GLB"),
+    ],
+)
+def test_bad_files_are_one_clear_error(tmp_path, name, content, message):
+    path = tmp_path / name
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(CorrmatError, match=message) as found:
+        read_scan(path)
+    assert "\n" not in str(found.value)
+
+
+@pytest.mark.parametrize("kind", [".ply", ".pcd", ".npy", ".npz", ".glb"])
+def test_a_file_cut_short_is_an_error_not_fewer_points(tmp_path, kind):
+    path = tmp_path / f"whole{kind}"
+    if kind == ".glb":
+        trimesh.creation.box().export(path)
+    else:
+        write(path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(0.7 * len(whole))])
+    with pytest.raises(CorrmatError, match=f"cannot be read as {kind[1:].upper()}"):
+        read_scan(path)
+
+
+def test_arrays_that_could_run_code_are_refused(tmp_path):
+    np.save(tmp_path / "objects.npy", np.array([{}], object), allow_pickle=True)
+    with pytest.raises(CorrmatError, match="cannot be read as NPY"):
+        read_scan(tmp_path / "objects.npy")
+
+
+def test_an_npz_with_two_clouds_is_ambiguous(tmp_path):
+    np.savez(tmp_path / "two.npz", a=POINTS, b=POINTS)
+    with pytest.raises(CorrmatError, match="2 arrays of points"):
+        read_scan(tmp_path / "two.npz")
+
+
+def test_writing_into_no_folder_says_so(tmp_path):
+    with pytest.raises(CorrmatError, match="no folder"):
+        write_ply(tmp_path / "none" / "cloud.ply", POINTS)
