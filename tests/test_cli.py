@@ -100,3 +100,23 @@ def test_a_checkpoint_of_another_network_is_refused(tmp_path, capsys):
     assert main([*evaluate, "--checkpoint", str(broken)]) == 2
     assert main([*evaluate, "--checkpoint", str(tmp_path / "none.ckpt")]) == 2
     assert "train first" in capsys.readouterr().err
+
+
+def test_a_shell_completes_commands_and_typed_options():
+    found = run("completion", "bash")
+    assert found.returncode == 0, found.stderr
+    for word in ("register", "--config", "--data.num_points", "--trainer.max_steps"):
+        assert word in found.stdout
+    checked = subprocess.run(["bash", "-n"], input=found.stdout, capture_output=True, text=True)
+    assert checked.returncode == 0, checked.stderr
+
+
+def test_how_much_is_printed_is_a_choice(tmp_path):
+    """Quiet: the table and nothing before it; otherwise a line a validation."""
+    words = [*FIT[1:], "--runs", str(tmp_path / "runs"), "--logger", "none"]
+    loud = run("run", *words, "--results", str(tmp_path / "a"))
+    quiet = run("run", *words, "--results", str(tmp_path / "b"), "--quiet")
+    assert loud.stdout.count("step ") == 4
+    assert "step " not in quiet.stdout
+    assert quiet.stdout.lstrip().startswith("1.1  full clouds, any rotation")
+    assert not list((tmp_path / "runs").glob("**/wandb"))

@@ -24,6 +24,9 @@ EPILOG = """examples:
   corrmat data --sheet shapes.png
       make the embedded data set, draw its families
 
+  eval "$(corrmat completion bash)"
+      commands, options and files by the tab key (zsh, tcsh: the same)
+
 Whatever a recipe sets can be set here: --data.*, --network.*, --optimizer.*, --trainer.*
 (Lightning's own Trainer) and --seed; corrmat fit --help lists them all with their types.
 
@@ -65,6 +68,22 @@ def reproduce(experiment: str) -> None:
 
 
 def _command(words: list[str]) -> int:
+    known, options = _parser().parse_known_args(words)
+    plain = {
+        "register": lambda: _register(known),
+        "example": lambda: _example(known.folder),
+        "data": lambda: _data(known.sheet),
+        "robustness": lambda: _robustness(known.scale, known.results, known.seed),
+        "report": lambda: _report(known.results, known.output, known.docs),
+        "completion": lambda: _completion(known.shell),
+    }
+    if known.command not in plain:
+        return _experiment(known, options)
+    _refuse(options)
+    return plain[known.command]()
+
+
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "corrmat",
         description="Correspondence Matrices are Underrated (3DV 2020), reproduced.",
@@ -105,23 +124,9 @@ def _command(words: list[str]) -> int:
     )
     report.add_argument("-o", "--output", type=Path, help="write all records as one HTML page")
     report.add_argument("--docs", type=Path, help="folder of README.md and docs/: rewrite tables")
-    known, options = parser.parse_known_args(words)
-    if known.command == "data":
-        _refuse(options)
-        return _data(known.sheet)
-    if known.command == "register":
-        _refuse(options)
-        return _register(known)
-    if known.command == "example":
-        _refuse(options)
-        return _example(known.folder)
-    if known.command == "robustness":
-        _refuse(options)
-        return _robustness(known.scale, known.results, known.seed)
-    if known.command == "report":
-        _refuse(options)
-        return _report(known.results, known.output, known.docs)
-    return _experiment(known, options)
+    completion = commands.add_parser("completion", help="print what makes a shell complete words")
+    completion.add_argument("shell", choices=["bash", "zsh", "tcsh"])
+    return parser
 
 
 def _experiment_options(command: argparse.ArgumentParser, name: str) -> None:
@@ -311,6 +316,22 @@ def _data(sheet: Path | None) -> int:
 
         draw(shapes.load("train"), sheet)
         print(f"drawn: {sheet}")
+    return 0
+
+
+def _completion(shell: str) -> int:
+    import shtab
+
+    from corrmat import recipe
+
+    parser = _parser()
+    commands = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
+    typed = [name for a in recipe.parser("DCP_corr")._actions for name in a.option_strings]
+    for command in ("run", "fit", "evaluate"):
+        for name in typed:
+            if "." in name or name == "--seed":
+                commands.choices[command].add_argument(name, metavar="VALUE")
+    print(shtab.complete(parser, shell))
     return 0
 
 
