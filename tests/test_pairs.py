@@ -212,3 +212,58 @@ def test_too_few_points_are_an_error_that_says_how_many():
         RegistrationDataModule(train_shapes=1).train_dataloader()
     with pytest.raises(CorrmatError, match="test split has 800 shapes, 801 were asked for"):
         RegistrationDataModule(test_shapes=801).test_dataloader()
+
+
+SCANS = {
+    "keep": 0.7, "sampling": "disjoint", "jitter": 0.01, "outliers": 0.1, "outlier_distance": 0.1,
+    "spoilt": "both", "normals": "estimated",
+}  # fmt: skip
+
+
+def test_both_clouds_can_be_cropped_noisy_and_hold_outliers(clouds):
+    pairs = pairs_of(clouds, **SCANS)
+    assert pairs.source.shape == pairs.target.shape == (5, 28, 6)
+    distance = torch.cdist(aligned(pairs), pairs.target[..., :3])
+    near, at = distance.min(2)
+    # Labels are of the clouds before their noise, which moves points by some hundredths.
+    assert ((pairs.match == 28) | (near < 0.2)).all()
+    assert ((pairs.match == 28) | (pairs.match == at)).double().mean() > 0.8
+    assert 0.1 < (pairs.match == 28).double().mean() < 0.95
+    clean = torch.cdist(pairs.source[..., :3], pairs.clean).amin(2)
+    assert ((clean > 0.1).sum(1) <= 3).all()  # 10 % of 28 are outliers, the rest lie on the shape
+
+
+def test_estimated_normals_come_from_the_cloud_itself(clouds):
+    from corrmat.data.normals import estimate
+
+    pairs = pairs_of(clouds, **SCANS)
+    for cloud in pairs.source.numpy():
+        assert (cloud[:, 3:] == estimate(cloud[:, :3])).all()
+    length = pairs.target[..., 3:].norm(dim=-1)
+    torch.testing.assert_close(length, torch.ones_like(length))
+
+
+def test_spoiling_both_clouds_leaves_the_draws_of_the_source_alone(clouds):
+    one = pairs_of(clouds, **SCANS | {"spoilt": "source"})
+    both = pairs_of(clouds, **SCANS)
+    assert torch.equal(one.source, both.source)
+    assert torch.equal(one.rotation, both.rotation)
+
+
+def test_stretched_shapes_are_others_of_the_same_size(clouds):
+    plain = pairs_of(clouds, **SCANS)
+    drawn = pairs_of(clouds, **SCANS, stretch=1.5)
+    assert not torch.equal(drawn.clean, plain.clean)
+    radius = drawn.clean.norm(dim=-1).amax(1)
+    torch.testing.assert_close(radius, torch.ones_like(radius))
+    for before, after in zip(plain.clean.double(), drawn.clean.double(), strict=True):
+        factors = torch.linalg.lstsq(before, after).solution
+        torch.testing.assert_close(factors, factors.diagonal().diag(), atol=1e-5, rtol=0)
+        share = factors.diagonal().abs() / factors.diagonal().abs().max()
+        assert share.min() > 1.5**-2 - 1e-6
+
+
+@pytest.mark.parametrize("stretch", [0.5, 2.0])
+def test_stretching_needs_estimated_normals(stretch):
+    with pytest.raises(CorrmatError, match="stretch"):
+        PairSettings(stretch=stretch)

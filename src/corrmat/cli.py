@@ -34,6 +34,32 @@ exit codes: 0 done; 1 interrupted (the same command goes on from its checkpoint)
 2 something given cannot be used, and one line says what."""
 
 
+EXPERIMENT_COMMANDS = {
+    "run": (
+        "train and test every arm, write a record, print it beside the paper's",
+        """examples:
+  corrmat run --config configs/exp/1.2.yaml
+  corrmat run --config configs/exp/1.2.yaml --scale smoke --logger none -q
+  corrmat run --config configs/exp/1.1.yaml --data.data modelnet40 --data.root /data""",
+    ),
+    "fit": (
+        "train one arm",
+        """examples:
+  corrmat fit --config configs/exp/1.1.yaml
+  corrmat fit --config configs/exp/2.2.yaml --arm RPMNet --trainer.max_steps 500
+  corrmat fit --config configs/exp/outliers.yaml --arm DCP_corr --network.outlier dustbin
+Ctrl-C saves a checkpoint; the same command goes on from it.""",
+    ),
+    "evaluate": (
+        "test the checkpoint of one arm, or compare models on pairs of a protocol",
+        """examples:
+  corrmat evaluate --config configs/exp/1.1.yaml
+  corrmat evaluate --config configs/exp/1.1.yaml --checkpoint best.ckpt --data.rotation_deg 45
+  corrmat evaluate --models corrmat,ransac,fgr,icp --protocol real
+  corrmat evaluate --models corrmat,dcp_v1.t7 --data modelnet40 --root /data --points 1024""",
+    ),
+}
+
 REGISTER_EPILOG = """examples:
   corrmat register scan1.ply scan2.ply
       print the 4 x 4 matrix that takes scan1 onto scan2, and how far to trust it
@@ -90,22 +116,17 @@ def _parser() -> argparse.ArgumentParser:
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    raw = argparse.RawDescriptionHelpFormatter
     commands = parser.add_subparsers(dest="command", metavar="command", required=True)
-    for name, purpose in (
-        (
-            "run",
-            "train and test both arms, write a record, print it beside the paper's",
-        ),
-        ("fit", "train one arm"),
-        ("evaluate", "test the checkpoint of one arm"),
-    ):
+    for name, (purpose, examples) in EXPERIMENT_COMMANDS.items():
         command = commands.add_parser(
-            name, help=purpose, description=purpose, add_help=False, allow_abbrev=False
-        )
+            name, help=purpose, description=purpose, add_help=False, allow_abbrev=False,
+            epilog=examples, formatter_class=raw,
+        )  # fmt: skip
         _experiment_options(command, name)
     _register_options(commands.add_parser(
         "register", help="how two clouds of your own lie to each other", epilog=REGISTER_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=raw,
     ))  # fmt: skip
     example = commands.add_parser("example", help="write two scans to try register on")
     example.add_argument("folder", type=Path, help="for source.ply, target.ply and truth.json")
@@ -116,9 +137,16 @@ def _parser() -> argparse.ArgumentParser:
         help="smoke: 20 draws a point of a curve instead of 400")  # fmt: skip
     figure.add_argument("--results", type=Path, default=Path("results"), help="folder of records")
     figure.add_argument("--seed", type=int, default=0, help="of the draws")
-    data = commands.add_parser("data", help="make the embedded data set, draw its families")
+    data = commands.add_parser(
+        "data", help="make the embedded data set, draw its families",
+        epilog="example:\n  corrmat data --sheet shapes.png", formatter_class=raw,
+    )  # fmt: skip
     data.add_argument("--sheet", type=Path, metavar="PNG", help="draw one shape of every family")
-    report = commands.add_parser("report", help="one page, or the documents' tables, from results/")
+    report = commands.add_parser(
+        "report", help="one page, or the documents' tables, from results/",
+        epilog="examples:\n  corrmat report -o report.html\n  corrmat report results/ --docs .",
+        formatter_class=raw,
+    )  # fmt: skip
     report.add_argument(
         "results", type=Path, nargs="?", default=Path("results"), help="folder of records"
     )

@@ -6,6 +6,7 @@ import warnings
 import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -114,6 +115,7 @@ def run(recipe: Recipe, results: Path, runs: Path, logger: logs.Choice = "csv") 
         "seed": ready[0].settings.seed,
         "commit": record.commit(),
         "hardware": {"threads": torch.get_num_threads(), "gpu": torch.cuda.is_available()},
+        "versions": {name: version(name) for name in ("corrmat", "torch", "lightning", "numpy")},
         "bands_deg": list(recipe.bands_deg),
         "arms": scores,
         "baselines": baselines,

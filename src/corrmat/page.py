@@ -132,8 +132,9 @@ def _article(record: Mapping[str, Any], results: Path, plots: Plots) -> str:
     folder = results / record["scale"] / record["data"] / record["id"]
     heads, rows = report.table(record)
     source = f"results/{record['scale']}/{record['data']}/{record['id']}/metrics.json"
+    title = escape(f"{source}; {command(record)}", quote=True)
     cells = [
-        [escape(row[0]), *(f'<span title="{source}">{escape(cell)}</span>' for cell in row[1:])]
+        [escape(row[0]), *(f'<span title="{title}">{escape(cell)}</span>' for cell in row[1:])]
         for row in rows
     ]
     plots[f"{name}-curves"] = _curves(record)
@@ -161,6 +162,7 @@ def _provenance(record: Mapping[str, Any], source: str) -> str:
     )
     machine = record.get("hardware", {})
     where = f"{machine.get('threads', '?')} CPU threads" + (", a GPU" if machine.get("gpu") else "")
+    where += "".join(f", {name} {version}" for name, version in record.get("versions", {}).items())
     facts = (
         f"commit {record.get('commit')}, seed {record['seed']}, {where}. {effort}. File: {source}"
     )

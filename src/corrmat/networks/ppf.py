@@ -75,7 +75,7 @@ def signless_pair_features(offset: Tensor, normal: Tensor, neighbor_normal: Tens
 
     Eight bumps over the distance, one at each of a growing row of lengths; |n_r . d|, |n_i . d|
     and |n_r . n_i| for the unit offset d; and two products in which every normal comes twice:
-    (n_r . d)(n_i . d)(n_r . n_i), which tells a bulge from a dent, and (n_r x n_i . d)(n_r . n_i),
+    (n_r . d)(n_i . d)(n_r . n_i), which tells a bend from a step, and (n_r x n_i . d)(n_r . n_i),
     which changes its sign in a mirror and so tells left from right.
 
     Args:
