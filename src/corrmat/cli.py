@@ -98,7 +98,7 @@ def _command(words: list[str]) -> int:
     plain = {
         "register": lambda: _register(known),
         "example": lambda: _example(known.folder),
-        "data": lambda: _data(known.sheet),
+        "data": lambda: _data(known),
         "robustness": lambda: _robustness(known.scale, known.results, known.seed),
         "report": lambda: _report(known.results, known.output, known.docs),
         "completion": lambda: _completion(known.shell),
@@ -138,9 +138,14 @@ def _parser() -> argparse.ArgumentParser:
     figure.add_argument("--results", type=Path, default=Path("results"), help="folder of records")
     figure.add_argument("--seed", type=int, default=0, help="of the draws")
     data = commands.add_parser(
-        "data", help="make the embedded data set, draw its families",
-        epilog="example:\n  corrmat data --sheet shapes.png", formatter_class=raw,
+        "data", help="make the embedded data set, or fetch ModelNet40",
+        epilog="examples:\n  corrmat data --sheet a.png\n  corrmat data modelnet40 --root /data",
+        formatter_class=raw,
     )  # fmt: skip
+    data.add_argument("name", nargs="?", default="shapes", choices=["shapes", "modelnet40"])
+    data.add_argument("--root", type=Path, help="modelnet40: folder to fetch it into (2 GB)")
+    data.add_argument("--mirror", action="append", metavar="URL",
+        help="modelnet40: where its zip is; may be given more than once")  # fmt: skip
     data.add_argument("--sheet", type=Path, metavar="PNG", help="draw one shape of every family")
     report = commands.add_parser(
         "report", help="one page, or the documents' tables, from results/",
@@ -330,7 +335,18 @@ def _compare(known: argparse.Namespace) -> int:
     return 0
 
 
-def _data(sheet: Path | None) -> int:
+def _data(known: argparse.Namespace) -> int:
+    if known.name == "modelnet40":
+        from corrmat import console
+        from corrmat.data import modelnet40
+
+        if known.root is None:
+            raise CorrmatError("where to? --root folder")
+        console.listen(0)
+        folder = modelnet40.fetch(known.root, known.mirror or (modelnet40.SOURCE,))
+        print(f"{folder}: whole and readable; use it with DATA=modelnet40 ROOT={known.root}")
+        return 0
+
     from corrmat.data import shapes
 
     for split in shapes.SIZE:
@@ -339,11 +355,11 @@ def _data(sheet: Path | None) -> int:
             f"{split}: {len(clouds)} shapes of {len(clouds.names)} families, "
             f"kept in {shapes.cache_folder()}"
         )
-    if sheet is not None:
+    if known.sheet is not None:
         from corrmat.data.sheet import draw
 
-        draw(shapes.load("train"), sheet)
-        print(f"drawn: {sheet}")
+        draw(shapes.load("train"), known.sheet)
+        print(f"drawn: {known.sheet}")
     return 0
 
 

@@ -1,12 +1,37 @@
 """ModelNet40 as sampled clouds, in the official HDF5 layout (Qi et al., PointNet)."""
 
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
+from corrmat.data import download
 from corrmat.data.clouds import CloudSet, concatenate, read_hdf5
 from corrmat.errors import CorrmatError
 
 FOLDER = "modelnet40_ply_hdf5_2048"
 SOURCE = "https://shapenet.cs.stanford.edu/media/modelnet40_ply_hdf5_2048.zip"
+
+
+def fetch(root: Path, mirrors: Sequence[str] = (SOURCE,)) -> Path:
+    """Download and unpack the data set, where it is not there yet.
+
+    Args:
+        root: folder that `FOLDER` goes into; a zip that lies there already is taken.
+        mirrors: addresses of the zip.
+
+    Returns:
+        The data set's folder.
+
+    Raises:
+        CorrmatError: see `download.fetch` and `download.unzip`.
+    """
+    folder, archive = root / FOLDER, root / f"{FOLDER}.zip"
+    if not folder.is_dir():
+        if not archive.is_file():
+            download.fetch(mirrors, archive)
+        download.unzip(archive, root, FOLDER)
+    for split in ("train", "test"):
+        load(root, split)
+    return folder
 
 
 def load(root: Path, split: str) -> CloudSet:
