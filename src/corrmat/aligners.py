@@ -23,10 +23,26 @@ class Guesses(NamedTuple):
     matches: np.ndarray  # (K, 2) int64 rows of source and target, K may be 0
     confidence: np.ndarray  # (K,) in [0, 1]
 
+    def support(self, transform: np.ndarray, source: np.ndarray, target: np.ndarray) -> float:
+        """In [0, 1]: how much of the matches a motion explains; 1 if there are none.
+
+        Args:
+            transform: (4, 4).
+            source: (N, 3 or more), as the matches count its rows.
+            target: (M, 3 or more).
+        """
+        if not len(self.matches):
+            return 1.0
+        x, y = source[self.matches[:, 0], :3], target[self.matches[:, 1], :3]
+        off = np.linalg.norm(x @ transform[:3, :3].T + transform[:3, 3] - y, axis=1)
+        weight = np.sqrt(self.confidence)
+        return float(weight @ np.clip(1 - (off / _EXPLAINED) ** 2, 0, None) / weight.sum())
+
 
 Aligner = Callable[[np.ndarray, np.ndarray, int], Guesses]
 """(source (N, 6), target (M, 6), seed) -> Guesses; rows are xyz and unit normal."""
 
+_EXPLAINED = 0.2  # a match that stays off by more says nothing for a motion
 _NO_MATCHES = np.empty((0, 2), np.int64), np.empty(0)
 
 
@@ -41,7 +57,7 @@ class Learned:
     """
 
     def __init__(
-        self, network: nn.Module, reach: float = 0.1, most: int = 256, count: int = 8
+        self, network: nn.Module, reach: float = 0.15, most: int = 256, count: int = 16
     ) -> None:
         self.network = network.eval()
         self.reach, self.most, self.count = reach, most, count
@@ -63,7 +79,12 @@ class Learned:
         matches = torch.stack([i, j], 1).numpy()
         generator = torch.Generator().manual_seed(seed)
         rotation, translation, _ = consensus(
-            x[0, i, :3], y[0, j, :3], weight, self.reach, generator=generator, count=self.count
+            x[0, i, :3],
+            y[0, j, :3],
+            weight.sqrt(),
+            self.reach,
+            generator=generator,
+            count=self.count,
         )
         found = [_motion(r, t) for r, t in zip(rotation, translation, strict=True)]
         return Guesses(np.stack([*found, *alone]), matches, weight.double().numpy())

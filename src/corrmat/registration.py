@@ -17,7 +17,7 @@ from corrmat.errors import CorrmatError
 from corrmat.weights import load_model, shipped_about
 
 Refine = Literal["icp", "none"]
-SIZE = 512  # points of either cloud that an aligner sees
+SIZE = 1024  # points of either cloud that an aligner sees
 CHOICE = 2048  # that its guesses are compared on
 FULL = 20_000  # that the best guess is refined on
 MEDIAN = 0.6  # what the median distance from the centroid is scaled to: a radius of about one
@@ -85,13 +85,16 @@ def register(
     began = time.perf_counter()
     x, y = Cloud.of(source, "source", seed), Cloud.of(target, "target", seed)
     scale = 2 * MEDIAN / (x.median + y.median)
-    guesses = aligner(x.with_normals(scale, SIZE), y.with_normals(scale, SIZE), seed)
+    few = x.with_normals(scale, SIZE), y.with_normals(scale, SIZE)
+    guesses = aligner(*few, seed)
     judge = Judge(x.points(scale, CHOICE), y.points(scale, CHOICE))
     transforms = guesses.transforms
     if refine == "icp":
         transforms = np.stack([judge.icp(transform) for transform in transforms])
     agreements = [judge.agreement(transform) for transform in transforms]
-    best, agreement = transforms[np.argmax(agreements)], max(agreements)
+    supports = [guesses.support(transform, *few) for transform in transforms]
+    chosen = int(np.argmax(np.multiply(agreements, supports)))
+    best, agreement = transforms[chosen], agreements[chosen]
     full = Judge(x.points(scale, FULL), y.points(scale, FULL))
     if refine == "icp":
         best = full.icp(best)

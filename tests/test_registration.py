@@ -1,0 +1,284 @@
+"""`corrmat register`: two clouds of anybody's."""
+
+import json
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from conftest import shared
+
+import corrmat
+from corrmat import example, registration, view
+from corrmat.cli import main
+from corrmat.data.scans import read_scan, write_ply
+from corrmat.data.shapes import make_shape
+from corrmat.errors import CorrmatError
+from corrmat.weights import load_model
+
+BROWSER = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory):
+    """The example's two scans and their truth."""
+    folder = tmp_path_factory.mktemp("pair")
+    example.write(folder)
+    truth = np.array(json.loads((folder / "truth.json").read_text())["transform"])
+    return folder, read_scan(folder / "source.ply"), read_scan(folder / "target.ply"), truth
+
+
+def angle_deg(a, b):
+    cosine = (np.trace(a[:3, :3].T @ b[:3, :3]) - 1) / 2
+    return np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+
+
+def test_the_example_is_registered_within_two_degrees(pair):
+    _, source, target, truth = pair
+    found = corrmat.register(source, target)
+    assert angle_deg(found.transform, truth) < 2
+    moved, right = (source @ t[:3, :3].T + t[:3, 3] for t in (found.transform, truth))
+    assert np.linalg.norm(moved - right, axis=1).max() < 0.05 * example.MILLIMETRES
+    assert found.verdict == "aligned"
+    assert found.transform.dtype == np.float64
+    assert len(found.matches) == len(found.match_confidence) > 0
+    assert found.matches[:, 0].max() < len(source)
+    assert found.matches[:, 1].max() < len(target)
+
+
+def test_matches_name_the_users_rows(pair):
+    """Most confident matches lie near each other after the true motion."""
+    _, source, target, truth = pair
+    found = corrmat.register(source, target)
+    sure = found.matches[np.argsort(-found.match_confidence)[:20]]
+    moved = source[sure[:, 0]] @ truth[:3, :3].T + truth[:3, 3]
+    off = np.linalg.norm(moved - target[sure[:, 1]], axis=1)
+    assert np.median(off) < 0.2 * example.MILLIMETRES
+
+
+def test_the_order_of_rows_does_not_matter_and_the_seed_decides(pair):
+    _, source, target, _ = pair
+    rng = np.random.default_rng(0)
+    one = corrmat.register(source, target, seed=3)
+    two = corrmat.register(rng.permutation(source), rng.permutation(target), seed=3)
+    assert (one.transform == two.transform).all()
+    assert one.confidence == two.confidence
+    other = corrmat.register(source, target, seed=4)
+    assert (other.transform != one.transform).any()
+
+
+def test_swapped_clouds_give_the_inverse(pair):
+    _, source, target, _ = pair
+    there, back = corrmat.register(source, target), corrmat.register(target, source)
+    assert angle_deg(there.transform @ back.transform, np.eye(4)) < 2
+
+
+def test_any_unit_and_place_gives_the_same_motion(pair):
+    _, source, target, truth = pair
+    near = corrmat.register(source, target)
+    for factor, far in ((1e-3, 0.0), (1e3, 1e7)):
+        found = corrmat.register(factor * source + far, factor * target - far)
+        assert angle_deg(found.transform, truth) < 2
+        assert found.rmse == pytest.approx(factor * near.rmse, rel=0.2)
+
+
+def test_detail_far_from_the_origin_is_not_lost():
+    """Millimetres at coordinates of 1e7: the moved source meets the target to float64."""
+    rng = np.random.default_rng(0)
+    points = make_shape("test", 3)[0][:, :3].astype(np.float64)
+    rotation = registration_rotation(rng)
+    source = 1000 * points + 1e7
+    target = (1000 * points) @ rotation.T - 1e7
+    found = corrmat.register(source, target)
+    moved = source @ found.transform[:3, :3].T + found.transform[:3, 3]
+    assert np.linalg.norm(moved - target, axis=1).max() < 1e-3
+
+
+def registration_rotation(rng):
+    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
+    q = q * np.sign(np.diag(r))
+    return q * np.linalg.det(q)
+
+
+GRID = np.stack(np.meshgrid(*[np.arange(4.0)] * 3), -1).reshape(-1, 3)
+LINE = np.arange(50.0)[:, None] * np.array([1.0, 2.0, 3.0])
+
+
+@pytest.mark.parametrize(
+    ("cloud", "message"),
+    [
+        (GRID[:2], "2 points; a rotation needs at least 3"),
+        (np.vstack([GRID, [[np.nan, 0, 0]]]), "1 points are NaN or infinite, the first is row 64"),
+        (np.vstack([[[np.inf, 0, 0]], GRID]), "the first is row 0"),
+        (np.ones((9, 3)), "all points are equal; the rotation is not determined"),
+        (np.ones((9, 3)) * 1e7 + 0.1, "all points are equal; the rotation is not determined"),
+        (LINE, "all points lie on one line; the rotation is not determined"),
+        (LINE + 1e6, "all points lie on one line; the rotation is not determined"),
+        (GRID[:, :2], r"array of shape \(64, 2\)"),
+        (np.vstack([np.zeros((99, 3)), GRID - 1.5]), "most points are equal"),
+    ],
+)
+def test_clouds_that_determine_nothing_are_refused(cloud, message):
+    with pytest.raises(CorrmatError, match=f"source: .*{message}"):
+        registration.register(cloud, GRID, model="icp")
+    with pytest.raises(CorrmatError, match=f"target: .*{message}"):
+        registration.register(GRID, cloud, model="icp")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"model": "nobody"}, "no model 'nobody'"),
+        ({"refine": "much"}, "refine = 'much'"),
+        ({"seed": -1}, "seed = -1 is negative"),
+    ],
+)
+def test_unknown_options_are_refused(options, message):
+    with pytest.raises(CorrmatError, match=message):
+        registration.register(GRID, GRID, **options)
+
+
+def test_small_clouds_are_registered_or_doubted():
+    for cloud in (GRID[[0, 1, 4]], GRID[:5], GRID[[0, 1, 4, 16]]):
+        found = registration.register(cloud, cloud + 5)
+        assert np.isfinite(found.transform).all()
+        assert np.linalg.det(found.transform[:3, :3]) == pytest.approx(1)
+
+
+def test_clouds_that_have_nothing_in_common_are_doubtful(pair):
+    _, source, _, _ = pair
+    plane = np.random.default_rng(0).uniform(size=(900, 3)) * [1, 1, 0.001]
+    assert registration.register(source, plane).verdict.startswith("doubtful: ")
+
+
+def test_many_points_are_subsampled_evenly():
+    cloud = np.random.default_rng(0).normal(size=(100_000, 3))
+    found = registration.Cloud.of(cloud, "source", 0)
+    assert len(found.rows) == registration.FULL
+    assert len(set(found.rows.tolist())) == registration.FULL
+    assert np.abs(found.centre).max() < 0.03
+    assert abs(np.median(found.rows) - 50_000) < 1500  # from everywhere in the file
+
+
+def test_the_command_writes_what_it_promises(pair, tmp_path, capsys):
+    folder, source, target, truth = pair
+    out, result, html = (tmp_path / name for name in ("aligned.ply", "T.json", "view.html"))
+    words = [str(folder / "source.ply"), str(folder / "target.ply"), "-o", str(out)]
+    assert main(["register", *words, "--json", str(result), "--html", str(html)]) == 0
+    shown = capsys.readouterr().out
+    for word in (
+        "matrix",
+        "rotation",
+        "translation",
+        "RMSE",
+        "confidence",
+        "verdict",
+        "surer than",
+    ):
+        assert word in shown
+    found = json.loads(result.read_text())
+    assert {"transform", "confidence", "rmse", "verdict", "model", "seed", "seconds"} <= set(found)
+    transform = np.array(found["transform"])
+    assert angle_deg(transform, truth) < 2
+    assert np.allclose(read_scan(out), source @ transform[:3, :3].T + transform[:3, 3])
+    assert 1e6 < html.stat().st_size < 8e6
+    assert "http" not in html.read_text().split("<script", 1)[0]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["none.ply", "none.ply"], "none.ply: no such file"),
+        (["a.ply", "a.ply", "-o", "none/b.ply"], "no folder none"),
+        (["a.ply", "a.ply", "--html", "none/b.html"], "no folder none"),
+        (["a.ply", "a.ply", "--model", "none.pth"], "no model 'none.pth'"),
+        (["a.ply", "a.ply", "--model", "a.ply"], "a.ply is no checkpoint"),
+        (["a.ply", "two.xyz"], "target: 2 points"),
+    ],
+)
+def test_bad_input_is_one_line_and_code_2(words, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_ply(tmp_path / "a.ply", GRID)
+    (tmp_path / "two.xyz").write_text("0 0 0\n1 1 1\n")
+    assert main(["register", *words]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert message in said
+
+
+def test_a_checkpoint_that_could_run_code_is_refused(tmp_path):
+    """A pickle that would write a file when loaded: it is not, and one line says why."""
+    path = tmp_path / "model.pth"
+
+    class Trap:
+        def __reduce__(self):
+            return open, (str(tmp_path / "sprung"), "w")
+
+    torch.save({"state_dict": Trap()}, path)
+    with pytest.raises(CorrmatError, match="no checkpoint of tensors alone"):
+        load_model(path)
+    assert not (tmp_path / "sprung").exists()
+
+
+def test_a_checkpoint_of_another_network_names_what_does_not_fit(tmp_path):
+    path = tmp_path / "model.pth"
+    torch.save({"layer.weight": torch.zeros(3)}, path)
+    with pytest.raises(CorrmatError, match="none of DCP, RPMNet.*layer.weight"):
+        load_model(path)
+    torch.save({"emb_nn.conv1.weight": torch.zeros(64, 6, 1, 1)}, path)
+    with pytest.raises(CorrmatError, match="emb_nn.conv5.weight is missing"):
+        load_model(path)
+
+
+def test_the_authors_checkpoint_registers(pair):
+    """DCP v1 as its authors published it, on clouds no further turned than it was trained for."""
+    path = shared("reference", "dcp_v1.t7")
+    points = make_shape("test", 3)[0][:, :3].astype(np.float64)
+    angle = np.radians(30)
+    turn = np.array(
+        [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
+    )
+    found = corrmat.register(points, points @ turn.T, model=path)
+    assert found.model == str(path)
+    assert angle_deg(found.transform[:3, :3], turn) < 2
+
+
+def test_shipped_weights_are_small_and_hold_no_pickle():
+    from corrmat.weights import SHIPPED
+
+    content = SHIPPED.read_bytes()
+    assert len(content) < 8e6
+    assert content[8:9] == b"{"  # safetensors: a length, then JSON
+
+
+@pytest.mark.parametrize("model", ["ransac", "fgr"])
+def test_classical_pipelines_give_a_motion(pair, model):
+    pytest.importorskip("open3d")
+    _, source, target, _ = pair
+    found = corrmat.register(source, target, model=model)
+    assert found.transform.shape == (4, 4)
+    assert np.linalg.det(found.transform[:3, :3]) == pytest.approx(1, abs=1e-6)
+
+
+def test_without_open3d_the_classical_pipelines_say_what_to_install(pair, monkeypatch):
+    _, source, target, _ = pair
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    with pytest.raises(CorrmatError, match=r"pip install 'corrmat\[baselines\]'"):
+        corrmat.register(source, target, model="ransac")
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium at hand")
+def test_the_page_opens_in_a_browser(pair, tmp_path):
+    _, source, target, _ = pair
+    path = tmp_path / "view.html"
+    path.write_text(view.page(corrmat.register(source, target), source, target))
+    words = ["--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=8000"]
+    words += ["--enable-logging=stderr", "--dump-dom", path.as_uri()]
+    shown = subprocess.run([BROWSER, *words], capture_output=True, text=True, timeout=120)
+    assert "before, and the matches" in shown.stdout
+    assert "CONSOLE" not in "".join(line for line in shown.stderr if "Uncaught" in line)
+    assert 'class="gl-container"' in shown.stdout
