@@ -2,7 +2,7 @@
 
     python benchmarks/tune_classical.py        minutes; needs pip install 'corrmat[baselines]'
 
-The best settings are the defaults of `corrmat.aligners.ClassicalSettings`; all that were tried,
+The best settings are `RANSAC` and `FGR` in corrmat.aligners; all that were tried,
 with their recalls, are in results/register/tuning.json.
 """
 

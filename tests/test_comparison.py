@@ -39,7 +39,7 @@ def test_who_knows_the_truth_scores_everything_and_who_does_not_nothing(pairs, m
             transform[:3, 3] += 0.5
             transform[:3, :3] = transform[:3, :3] @ np.diag([1.0, -1, -1])
         found = type("Found", (), {})()
-        found.transform, found.seconds, found.agreement = transform, 0.01, 1.0
+        found.transform, found.seconds, found.agreement, found.support = transform, 0.01, 1.0, 1.0
         return found
 
     monkeypatch.setattr(comparison, "register", answer)

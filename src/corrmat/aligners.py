@@ -104,20 +104,22 @@ def icp(source: np.ndarray, target: np.ndarray, seed: int) -> Guesses:
 
 
 class ClassicalSettings(NamedTuple):
-    """Lengths and counts of the classical pipelines; benchmarks/tune_classical.py found them."""
+    """Lengths and counts of the classical pipelines."""
 
-    feature_radius: float = 0.5
+    feature_radius: float
+    reach: float
+    mutual: bool = True  # RANSAC only: keep matches that are each other's best
     feature_neighbors: int = 100
-    reach: float = 0.1
-    mutual: bool = True
     iterations: int = 100_000
 
 
+# The best of those that benchmarks/tune_classical.py tries on validation pairs.
+RANSAC = ClassicalSettings(feature_radius=0.65, reach=0.12)
+FGR = ClassicalSettings(feature_radius=0.65, reach=0.05)
+
+
 def ransac(
-    source: np.ndarray,
-    target: np.ndarray,
-    seed: int,
-    how: ClassicalSettings = ClassicalSettings(),  # noqa: B008 (immutable)
+    source: np.ndarray, target: np.ndarray, seed: int, how: ClassicalSettings = RANSAC
 ) -> Guesses:
     """FPFH features, RANSAC over their matches (Rusu et al., ICRA 2009; Open3D)."""
     o3d, clouds, features = _features(source, target, how)
@@ -139,12 +141,7 @@ def ransac(
     return Guesses(np.asarray(found.transformation)[None].copy(), *_NO_MATCHES)
 
 
-def fgr(
-    source: np.ndarray,
-    target: np.ndarray,
-    seed: int,
-    how: ClassicalSettings = ClassicalSettings(),  # noqa: B008 (immutable)
-) -> Guesses:
+def fgr(source: np.ndarray, target: np.ndarray, seed: int, how: ClassicalSettings = FGR) -> Guesses:
     """Fast Global Registration over FPFH features (Zhou et al., ECCV 2016; Open3D)."""
     o3d, clouds, features = _features(source, target, how)
     registration = o3d.pipelines.registration

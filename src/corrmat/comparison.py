@@ -96,7 +96,9 @@ def compare(pairs: PairBatch, models: Sequence[str], refine: Refine = "icp") -> 
             _row(pairs, index, model, refine)
             for index in track(range(len(pairs)), f"{model}", transient=True)
         ]
-        angle, near, ms, agreement = (np.array(column) for column in zip(*rows, strict=True))
+        angle, near, ms, agreement, support = (
+            np.array(column) for column in zip(*rows, strict=True)
+        )
         found[model] = {
             "mean_deg": float(angle.mean()),
             "median_deg": float(np.median(angle)),
@@ -108,6 +110,7 @@ def compare(pairs: PairBatch, models: Sequence[str], refine: Refine = "icp") -> 
                 "rotation_error_deg": np.round(angle, 4).tolist(),
                 "adds": np.round(near, 5).tolist(),
                 "agreement": np.round(agreement, 4).tolist(),
+                "support": np.round(support, 4).tolist(),
             },
         }
     return found
@@ -131,9 +134,7 @@ def table(models: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _row(
-    pairs: PairBatch, index: int, model: str, refine: Refine
-) -> tuple[float, float, float, float]:
+def _row(pairs: PairBatch, index: int, model: str, refine: Refine) -> tuple[float, ...]:
     source, target = (c[index].double().numpy() for c in (pairs.source, pairs.target))
     found = register(source, target, model=model, refine=refine)
     rotation, translation = pairs.rotation[index].double().numpy(), pairs.translation[index].numpy()
@@ -143,7 +144,7 @@ def _row(
     ours = clean @ found.transform[:3, :3].T + found.transform[:3, 3]
     near = float(KDTree(truth).query(ours)[0].mean())
     angle = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
-    return angle, near, 1e3 * found.seconds, found.agreement
+    return angle, near, 1e3 * found.seconds, found.agreement, found.support
 
 
 def _clouds(data: str, root: Path | None, split: str) -> CloudSet:

@@ -12,7 +12,7 @@ from corrmat.errors import CorrmatError
 from corrmat.files import replace_text
 from corrmat.ops import rigid
 
-SHAPE = 7  # of the test split
+SHAPE = 17  # of the test split: a guitar
 MILLIMETRES = 250.0  # its radius
 KEEP = 0.7  # of the points of either scan
 NOISE = 0.005  # of the radius

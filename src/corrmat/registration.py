@@ -34,6 +34,7 @@ class Registration:
     matches: np.ndarray  # (K, 2) int64 rows of source and target; K = 0 for models without
     match_confidence: np.ndarray  # (K,) in [0, 1]
     agreement: float  # in [0, 1]: how much of either cloud lies on the other
+    support: float  # in [0, 1]: how much of the matches the motion explains; 1 without any
     confidence: float  # in [0, 1]: calibrated chance that the clouds are aligned
     rmse: float  # of aligned source points that have a target point in reach, own units
     overlap: float  # share of source points that have one
@@ -94,17 +95,18 @@ def register(
     agreements = [judge.agreement(transform) for transform in transforms]
     supports = [guesses.support(transform, *few) for transform in transforms]
     chosen = int(np.argmax(np.multiply(agreements, supports)))
-    best, agreement = transforms[chosen], agreements[chosen]
+    best, agreement, support = transforms[chosen], agreements[chosen], supports[chosen]
     full = Judge(x.points(scale, FULL), y.points(scale, FULL))
     if refine == "icp":
         best = full.icp(best)
-    confidence = calibrated(agreement)
+    confidence = calibrated(agreement, support if len(guesses.matches) else None)
     overlap, rmse = full.fit(best)
     return Registration(
         transform=_in_own_units(best, scale, x.centre, y.centre),
         matches=np.stack([c.rows[m] for c, m in zip((x, y), guesses.matches.T, strict=True)], 1),
         match_confidence=guesses.confidence,
         agreement=agreement,
+        support=support,
         confidence=confidence,
         rmse=rmse / scale,
         overlap=overlap,
@@ -239,15 +241,21 @@ class Judge:
         return self.trees[1].query(moved)[0], self.trees[0].query(back)[0]
 
 
-def calibrated(agreement: float) -> float:
-    """The chance that clouds that agree so are aligned, as `shipping.calibrate` found it."""
-    logit = calibration()
-    return float(1 / (1 + np.exp(-(logit["slope"] * agreement + logit["offset"]))))
+def calibrated(agreement: float, support: float | None) -> float:
+    """The chance that a registration is right, as `shipping.calibrate` found it.
+
+    Args:
+        agreement: of the two clouds.
+        support: of the matches; None for a model that has none.
+    """
+    logit = calibration()["agreement" if support is None else "both"]
+    values = np.array([agreement, 1.0] if support is None else [agreement, support, 1.0])
+    return float(1 / (1 + np.exp(-np.dot(logit, values))))
 
 
 @functools.cache
-def calibration() -> dict[str, float]:
-    """Slope and offset of the logit over the agreement."""
+def calibration() -> dict[str, list[float]]:
+    """Coefficients of the logit over agreement, support and one; and over agreement and one."""
     return json.loads(shipped_about()["calibration"])
 
 

@@ -25,33 +25,38 @@ def ship(checkpoint: Path) -> None:
     about = {"method": method, "network": json.dumps(hparams), "commit": str(record.commit())}
     SHIPPED.parent.mkdir(exist_ok=True)
     # The weights are registered with before anybody knows how far to trust them.
-    about["calibration"] = json.dumps({"slope": 1.0, "offset": 0.0})
+    about["calibration"] = json.dumps({"both": [1, 1, -1], "agreement": [1, -0.5]})
     replace_bytes(SHIPPED, safetensors.torch.save(state, about))
     about["calibration"] = json.dumps(calibrate())
     replace_bytes(SHIPPED, safetensors.torch.save(state, about))
     print(f"{SHIPPED}: {SHIPPED.stat().st_size / 1e6:.1f} MB")
 
 
-def calibrate() -> dict[str, float]:
-    """Fit the chance that a pair is registered to how much its clouds agree.
+def calibrate() -> dict[str, list[float]]:
+    """Fit the chance that a pair is registered to agreement and support.
 
     On validation pairs of two difficulties, by logistic regression; `registration.calibrated`
     reads it.
 
     Returns:
-        slope and offset of the logit.
+        Coefficients over (agreement, support, 1) and over (agreement, 1).
     """
-    agreement, right = [], []
+    rows, right = [], []
     for protocol in ("real", "clean"):
         pairs = comparison.frozen_pairs(protocol, count=CALIBRATION_PAIRS // 2, split="val")
         found = comparison.compare(pairs, ["corrmat"])["corrmat"]["per_pair"]
-        agreement += found["agreement"]
+        rows += zip(found["agreement"], found["support"], strict=True)
         right += [near < comparison.NEAR for near in found["adds"]]
-    x, y = np.array(agreement), np.array(right, float)
+    x = np.column_stack([np.array(rows), np.ones(len(rows))])
+    y = np.array(right, float)
+    return {"both": _logistic(x, y), "agreement": _logistic(x[:, [0, 2]], y)}
 
-    def loss(parameters: np.ndarray) -> float:
-        logit = parameters[0] * x + parameters[1]
-        return float(np.mean(np.logaddexp(0, logit) - y * logit))
 
-    slope, offset = minimize(loss, np.array([1.0, 0.0])).x
-    return {"slope": float(slope), "offset": float(offset)}
+def _logistic(x: np.ndarray, y: np.ndarray) -> list[float]:
+    """Coefficients of a logit, with a breath of shrinkage where the classes part cleanly."""
+
+    def loss(coefficients: np.ndarray) -> float:
+        logit = x @ coefficients
+        return float(np.mean(np.logaddexp(0, logit) - y * logit) + 1e-4 * (coefficients**2).sum())
+
+    return minimize(loss, np.zeros(x.shape[1])).x.tolist()
