@@ -18,8 +18,8 @@ import yaml
 from torch import Tensor, nn
 
 from corrmat.errors import CorrmatError
-from corrmat.methods import METHODS
 from corrmat.networks.dcp import DCPNetwork
+from corrmat.networks.invariant import InvariantNetwork
 from corrmat.networks.pcrnet import PCRNetCorrNetwork, PCRNetwork
 from corrmat.networks.rpmnet import RPMNetwork
 
@@ -109,8 +109,7 @@ def load_model(model: str | Path = "corrmat") -> nn.Module:
             network; the message says which do not.
     """
     if str(model) == "corrmat":
-        about = shipped_about()
-        network = METHODS[about["method"]].network_type(**json.loads(about["network"]))
+        network = InvariantNetwork(**json.loads(shipped_about()["network"]))
         return _filled(network, safetensors.torch.load_file(SHIPPED))
     path = Path(model)
     state = _tensors(path)
@@ -153,6 +152,8 @@ def own_checkpoint(path: Path) -> tuple[str, dict[str, Any], nn.Module]:
     Raises:
         CorrmatError: settings.yaml is not beside it, or it does not fit.
     """
+    from corrmat.methods import METHODS  # brings Lightning, for which register does not wait
+
     settings = path.parent / "settings.yaml"
     if not settings.is_file():
         raise CorrmatError(f"{path} is a checkpoint of corrmat, but {settings} is not beside it")
