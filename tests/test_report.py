@@ -68,6 +68,7 @@ def test_the_figure_is_drawn_the_same_twice(tmp_path):
         ("README.md", "results", lambda records, _: report.markdown_summary(records)),
         ("docs/reproduction.md", "tables", lambda records, _: report.markdown_tables(records)),
         ("README.md", "register", lambda _, results: report.markdown_register(results)),
+        ("docs/register.md", "networks", lambda _, results: report.markdown_networks(results)),
     ],
 )
 def test_the_documents_say_what_the_records_say(page, name, make):

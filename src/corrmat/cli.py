@@ -410,6 +410,8 @@ def _report(results: Path, output: Path | None, docs: Path | None) -> int:
         pages = docs / "README.md", docs / "docs" / "reproduction.md"
         report.refresh(pages[0], "results", report.markdown_summary(records))
         report.refresh(pages[0], "register", report.markdown_register(results))
+        networks = report.markdown_networks(results)
+        report.refresh(docs / "docs" / "register.md", "networks", networks)
         report.refresh(pages[1], "tables", report.markdown_tables(records))
         print(f"{len(records)} records -> {pages[0]}, {pages[1]}")
     return 0

@@ -19,7 +19,12 @@ from corrmat.figures import COLOURS, PANELS
 
 GREEN, RED, BLUE = "#2ca02c", "#d62728", "#1f77b4"
 # What a family's numbers depend on, below src/corrmat; the recipes come on top.
-CODE = ("ops", "losses.py", "module.py", "data")
+CODE = (
+    "ops/rigid.py", "ops/correspondence.py", "ops/streaming.py", "ops/sinkhorn.py",
+    "ops/neighbors.py", "data/pairs.py", "data/datamodule.py", "data/clouds.py",
+    "data/normals.py", "data/modelnet40.py", "data/shapes.py", "data/families.py",
+    "data/solids.py", "losses.py", "module.py",
+)  # fmt: skip
 FAMILY_CODE = {
     "DCP": (
         "networks/dcp.py",
@@ -283,7 +288,7 @@ def _view(view: Mapping[str, Any]) -> dict[str, Any]:
     return {"data": data, "layout": layout}
 
 
-def _thinned(points: np.ndarray, most: int = 250) -> np.ndarray:
+def _thinned(points: np.ndarray, most: int = 160) -> np.ndarray:
     """Every so many points, so that the page stays small."""
     return points[:: -(-len(points) // most)]
 
@@ -305,7 +310,7 @@ def _lines(
     name: str,
     colour: str,
 ) -> dict[str, Any]:
-    chosen = np.flatnonzero(which)[:: max(1, len(which) // 100)]
+    chosen = np.flatnonzero(which)[:: max(1, len(which) // 70)]
     ends: list[list[float | None]] = [[], [], []]
     for i in chosen:
         for axis in range(3):

@@ -156,6 +156,19 @@ def markdown_register(results: Path) -> str:
     return "\n".join(lines)
 
 
+def markdown_networks(results: Path) -> str:
+    """The table of docs/register.md: other networks of this project in the shipped one's place."""
+    path = results / "register" / "networks.json"
+    if not path.is_file():
+        return "No comparison is recorded."
+    lines = [_row(["network", "recall at 5 deg", "recall ADD-S"]), "|---|---|---|"]
+    for name, found in json.loads(path.read_text())["models"].items():
+        parts = Path(name).parts
+        shown = f"{parts[-2]}, experiment {parts[-3]}" if len(parts) > 2 else f"{name} (shipped)"
+        lines.append(_row([shown, f"{found['recall_5deg']:.0%}", f"{found['recall_adds']:.0%}"]))
+    return "\n".join(lines)
+
+
 def read_records(results: Path, scale: str = "*") -> list[dict[str, Any]]:
     """Every record below a folder, ordered by scale, experiment and data."""
     found = results.glob(f"{scale}/*/*/metrics.json")
