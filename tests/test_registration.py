@@ -58,6 +58,7 @@ def test_matches_name_the_users_rows(pair):
     moved = source[sure[:, 0]] @ truth[:3, :3].T + truth[:3, 3]
     off = np.linalg.norm(moved - target[sure[:, 1]], axis=1)
     assert np.median(off) < 0.2 * example.MILLIMETRES
+    assert 0.3 < found.match_agrees.mean() < 1
 
 
 def test_the_order_of_rows_does_not_matter_and_the_seed_decides(pair):
@@ -177,7 +178,7 @@ def test_the_command_writes_what_it_promises(pair, tmp_path, capsys):
         "RMSE",
         "confidence",
         "verdict",
-        "surer than",
+        "agree with",
     ):
         assert word in shown
     found = json.loads(result.read_text())

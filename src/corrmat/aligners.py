@@ -33,10 +33,16 @@ class Guesses(NamedTuple):
         """
         if not len(self.matches):
             return 1.0
+        weight = np.sqrt(self.confidence)
+        return float(weight @ self.explained(transform, source, target) / weight.sum())
+
+    def explained(
+        self, transform: np.ndarray, source: np.ndarray, target: np.ndarray
+    ) -> np.ndarray:
+        """(K,) in [0, 1]: how well a motion explains each match; arguments as for `support`."""
         x, y = source[self.matches[:, 0], :3], target[self.matches[:, 1], :3]
         off = np.linalg.norm(x @ transform[:3, :3].T + transform[:3, 3] - y, axis=1)
-        weight = np.sqrt(self.confidence)
-        return float(weight @ np.clip(1 - (off / _EXPLAINED) ** 2, 0, None) / weight.sum())
+        return np.clip(1 - (off / _EXPLAINED) ** 2, 0, None)
 
 
 Aligner = Callable[[np.ndarray, np.ndarray, int], Guesses]

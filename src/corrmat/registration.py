@@ -21,7 +21,6 @@ SIZE = 1024  # points of either cloud that an aligner sees
 CHOICE = 2048  # that its guesses are compared on
 FULL = 20_000  # that the best guess is refined on
 MEDIAN = 0.6  # what the median distance from the centroid is scaled to: a radius of about one
-SURE = 0.5  # a match of more confidence than this counts as confident
 TRUST = 0.5  # confidence from where on the verdict is "aligned"
 _FLAT = 1e-6  # thinner than this against its length, a cloud is a line
 
@@ -32,7 +31,8 @@ class Registration:
 
     transform: np.ndarray  # (4, 4) float64, T_target_source in the clouds' own units
     matches: np.ndarray  # (K, 2) int64 rows of source and target; K = 0 for models without
-    match_confidence: np.ndarray  # (K,) in [0, 1]
+    match_confidence: np.ndarray  # (K,) in [0, 1]; neighbours of the same point share it
+    match_agrees: np.ndarray  # (K,) bool: whether the motion takes one end near the other
     agreement: float  # in [0, 1]: how much of either cloud lies on the other
     support: float  # in [0, 1]: how much of the matches the motion explains; 1 without any
     confidence: float  # in [0, 1]: calibrated chance that the clouds are aligned
@@ -105,6 +105,7 @@ def register(
         transform=_in_own_units(best, scale, x.centre, y.centre),
         matches=np.stack([c.rows[m] for c, m in zip((x, y), guesses.matches.T, strict=True)], 1),
         match_confidence=guesses.confidence,
+        match_agrees=guesses.explained(transforms[chosen], *few) > 0,
         agreement=agreement,
         support=support,
         confidence=confidence,
@@ -277,8 +278,8 @@ def text(found: Registration) -> str:
         f"RMSE         {found.rmse:.6g} of those",
     ]
     if len(found.matches):
-        sure = int((found.match_confidence > SURE).sum())
-        lines.append(f"matches      {sure} of {len(found.matches)} surer than {SURE:.0%}")
+        agree, matches = found.match_agrees.sum(), len(found.matches)
+        lines.append(f"matches      {agree} of {matches} agree with the motion")
     lines += [f"confidence   {found.confidence:.0%}", f"verdict      {found.verdict}"]
     return "\n".join([*lines, f"({found.model}, seed {found.seed}, {found.seconds:.2f} s)"])
 

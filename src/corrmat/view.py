@@ -83,7 +83,7 @@ def _matches(found: Registration, source: np.ndarray, target: np.ndarray) -> go.
             "color": confidence,
             "colorscale": "Viridis",
             "cmin": 0,
-            "cmax": 1,
+            "cmax": float(found.match_confidence.max()),
             "colorbar": {"title": "confidence", "thickness": 12, "len": 0.6},
         },
         hoverinfo="skip",
