@@ -29,7 +29,7 @@ class RPMNetwork(nn.Module):
         iterations: turns in training.
         test_iterations: turns in evaluation.
         sinkhorn_iterations: normalisations of rows and columns a turn.
-        slack: see `sinkhorn`.
+        slack: see `sinkhorn_potentials`.
         annealing_width: of the annealing net's pooled feature.
     """
 
