@@ -27,7 +27,10 @@ from twins import PlainNormLinear  # noqa: E402
 
 from corrmat.data import shapes  # noqa: E402
 from corrmat.data.pairs import Key, PairSettings, make_pairs  # noqa: E402
+from corrmat.losses import correspondence_loss  # noqa: E402
 from corrmat.methods import METHODS  # noqa: E402
+from corrmat.ops import streaming  # noqa: E402
+from corrmat.ops.correspondence import SoftCorrespondence  # noqa: E402
 from corrmat.types import PairBatch  # noqa: E402
 
 DCP_LAPTOP = {"width": 128, "feedforward": 256, "edge_channels": (32, 32, 64, 128), "k": 6}
@@ -54,6 +57,11 @@ def main() -> None:
         row |= in_a_process(training_step, method, hparams, n, batch)
         if method == "DCP_corr":
             row |= in_a_process(against_naive, hparams, n, min(batch, 4))
+        rows.append(row)
+        print(format_row(row), flush=True)
+    for n in (512, 2048, 8192):
+        row = {"what": f"correspondence loss and pose, d=512, N={n}, streamed"}
+        row |= in_a_process(against_dense, n)
         rows.append(row)
         print(format_row(row), flush=True)
     path = ROOT / "results" / "bench" / "bench.json"
@@ -89,6 +97,29 @@ def against_naive(hparams: dict[str, Any], n: int, batch: int) -> dict[str, floa
         _, step = build("DCP_corr", hparams, n, batch, naive)
         seconds.append(median(step, repeats=5))
     return {"naive_ratio": round(seconds[1] / seconds[0], 2)}
+
+
+def against_dense(n: int) -> dict[str, float]:
+    """Milliseconds of loss, pose and gradient, how many times longer the whole matrix takes."""
+    torch.manual_seed(0)
+    f_x, f_y = (torch.randn(1, n, 512).requires_grad_() for _ in range(2))
+    y, match = torch.randn(1, n, 3), torch.arange(n).unsqueeze(0)
+
+    def step() -> None:
+        c = SoftCorrespondence(f_x, f_y, 512**-0.5)
+        (c.soft_target(y).sum() + correspondence_loss(c, match)).backward()
+
+    seconds, held = [], peak_mb()
+    for most in (0, n * n):  # entries up to which the matrix is made whole
+        streaming._DENSE = most
+        seconds.append(median(step, repeats=3))
+        if not most:
+            used = peak_mb() - held
+    return {
+        "ms": round(1e3 * seconds[0], 1),
+        "peak_mb": round(used),
+        "dense_ratio": round(seconds[1] / seconds[0], 2),
+    }
 
 
 def build(
