@@ -19,7 +19,7 @@ def softmax_rows(
     """Log-sum-exp of the rows of S = F_X F_Y^T, and the mean of values under their softmax.
 
     Memory grows with N and M, not with their product, in the backward pass as well. Where the
-    whole matrix is small, it is made: that is nearly twice as fast (benchmarks/bench.py).
+    whole matrix is small, it is made: that is a little faster (`make bench` says how much).
 
     Args:
         f_x: (B, N, d).
