@@ -244,7 +244,7 @@ def _register(known: argparse.Namespace) -> int:
 
     source, target = (read_scan(path, known.seed) for path in (known.source, known.target))
 
-    from corrmat import registration, view
+    from corrmat import registration
 
     found = registration.register(
         source, target, model=known.model, refine=known.refine, seed=known.seed
@@ -258,6 +258,8 @@ def _register(known: argparse.Namespace) -> int:
         replace_text(known.json, registration.json_text(found))
         print(f"result: {known.json}")
     if known.html is not None:
+        from corrmat import view  # plotly takes a second to load
+
         replace_text(known.html, view.page(found, source, target))
         print(f"to look at: {known.html}")
     return 0

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import torch
 from rich.progress import track
 from scipy.spatial import KDTree
 
@@ -17,6 +18,7 @@ from corrmat.data.clouds import CloudSet
 from corrmat.data.pairs import STREAM, Key, PairSettings, Split, make_pairs
 from corrmat.errors import CorrmatError
 from corrmat.files import replace_text
+from corrmat.metrics import rotation_error_deg
 from corrmat.registration import Refine, register
 from corrmat.types import PairBatch
 
@@ -138,12 +140,12 @@ def _row(pairs: PairBatch, index: int, model: str, refine: Refine) -> tuple[floa
     source, target = (c[index].double().numpy() for c in (pairs.source, pairs.target))
     found = register(source, target, model=model, refine=refine)
     rotation, translation = pairs.rotation[index].double().numpy(), pairs.translation[index].numpy()
-    cosine = (np.trace(found.transform[:3, :3].T @ rotation) - 1) / 2
     clean = pairs.clean[index].double().numpy()
     truth = clean @ rotation.T + translation
     ours = clean @ found.transform[:3, :3].T + found.transform[:3, 3]
     near = float(KDTree(truth).query(ours)[0].mean())
-    angle = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+    turned = torch.from_numpy(found.transform[:3, :3])
+    angle = float(rotation_error_deg(turned[None], pairs.rotation[index, None].double()))
     return angle, near, 1e3 * found.seconds, found.agreement, found.support
 
 
