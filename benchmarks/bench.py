@@ -23,7 +23,7 @@ import torch
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 
-from twins import PlainNormLinear  # noqa: E402
+from twins import PlainEdgeConvolution  # noqa: E402
 
 from corrmat.data import shapes  # noqa: E402
 from corrmat.data.pairs import Key, PairSettings, make_pairs  # noqa: E402
@@ -134,7 +134,7 @@ def build(
     adam = torch.optim.Adam(module.parameters(), 1e-4)
     if naive:
         for layer in module.network.embed.edge:  # type: ignore[union-attr]
-            layer.__class__ = PlainNormLinear
+            layer.__class__ = PlainEdgeConvolution
 
     def step() -> None:
         adam.zero_grad()

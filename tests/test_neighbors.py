@@ -54,7 +54,7 @@ def test_pair_features_do_not_change_when_the_cloud_moves(generator):
     shifted = neighborhoods(cloud, 0.9, 5).moved(r, t)
     for one, other in zip(again, shifted, strict=True):
         torch.testing.assert_close(one, other)
-    assert again.features().shape == (1, 10, 40, 5)
-    features = again.features()[0, :, 7, 2]
+    assert again.features().shape == (1, 40, 5, 10)
+    features = again.features()[0, 7, 2]
     torch.testing.assert_close(features[:3], moved[0, 7, :3])
     torch.testing.assert_close(features[6:], again.ppf[0, 7, 2])

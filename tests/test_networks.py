@@ -1,12 +1,25 @@
 import pytest
 import torch
-from twins import PlainNormLinear, attention, std_norm
+from twins import PlainEdgeConvolution, attention, neighborhood_net, std_norm
 
 from corrmat.methods import DCP, METHODS, DCPCorr
+from corrmat.networks import edges
 from corrmat.networks.attention import Attention, StdNorm, Transformer
 from corrmat.networks.dcp import DCPNetwork
-from corrmat.networks.dgcnn import DGCNN, FoldedNormLinear, edge_features
+from corrmat.networks.dgcnn import DGCNN, EdgeConvolution, edge_features
+from corrmat.networks.edges import moments
+from corrmat.networks.ppf import neighborhoods
+from corrmat.networks.rpmnet import NeighborhoodNet
 from corrmat.ops.neighbors import knn
+from corrmat.types import PairBatch
+
+TINY = {
+    "DCP": {"width": 32, "feedforward": 32, "edge_channels": (8, 8, 12, 16), "k": 5},
+    "RPMNet": {"width": 16, "k": 6, "radius": 1.5, "annealing_width": 16},
+    "PCRNet": {"width": 32},
+    "Invariant": {"width": 32, "layers": 1, "anchors": 8, "neighbors": 4},
+}
+STATISTICS = ("running_mean", "running_var", "num_batches_tracked")
 
 
 def small(pointer="transformer"):
@@ -15,50 +28,75 @@ def small(pointer="transformer"):
 
 
 @pytest.mark.parametrize("mode", ["train", "eval"])
-def test_folded_norm_equals_the_plain_layer(mode, generator):
+@pytest.mark.parametrize("last", [False, True])
+def test_folded_batch_norm_equals_the_plain_layer(mode, last):
     """Values, every gradient, and the running statistics that training leaves behind."""
+
+    def draw(seed, *shape):
+        chance = torch.Generator().manual_seed(seed)
+        return torch.randn(*shape, dtype=torch.float64, generator=chance)
+
     found = []
-    for kind in (FoldedNormLinear, PlainNormLinear):
+    for kind in (EdgeConvolution, PlainEdgeConvolution):
         torch.manual_seed(1)
-        layer = kind(6, 10).double()
-        layer.norm.weight.data = torch.linspace(-1, 2, 10, dtype=torch.float64)
-        layer.norm.bias.data = torch.linspace(-0.5, 0.5, 10, dtype=torch.float64)
-        layer(
-            torch.randn(4, 30, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
-            + 1
-        )
-        layer.train(mode == "train")
-        rows = torch.randn(
-            4, 30, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(3)
-        )
-        rows.requires_grad_()
-        out, top = layer(rows)
-        pull = torch.randn(
-            out.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(4)
-        )
-        ((out * pull).sum() + (top * pull[0]).sum()).backward()
-        stats = [layer.norm.running_mean, layer.norm.running_var, layer.norm.num_batches_tracked]
-        found.append([out, top, rows.grad, *(p.grad for p in layer.parameters()), *stats])
+        layers = [kind(6, 10).double(), kind(10, 5).double()]
+        for layer in layers:
+            layer.norm.weight.data = torch.linspace(-1, 2, len(layer.norm.weight)).double()
+            layer.norm.bias.data = torch.linspace(-0.5, 0.5, len(layer.norm.bias)).double()
+        rows = (draw(2, 1, 30, 4, 6) + 1).requires_grad_()
+        first = layers[0](rows, moments(rows))
+        layers[1](first.rows, first.moments)  # leaves running statistics
+        for layer in layers:
+            layer.train(mode == "train")
+        seen = moments(rows) if mode == "train" else None
+        first = layers[0](rows, seen)
+        second = layers[1](first.rows, first.moments, last=last)
+        value = (first.top * draw(3, 1, 30, 10)).sum() + (second.top * draw(4, 1, 30, 5)).sum()
+        if not last:
+            value = value + (second.rows * draw(5, 1, 30, 4, 5)).sum()
+        value.backward()
+        stats = [getattr(layer.norm, name) for layer in layers for name in STATISTICS]
+        grads = [p.grad for layer in layers for p in layer.parameters()]
+        found.append([first.rows, first.top, second.top, rows.grad, *grads, *stats])
     for fast, naive in zip(*found, strict=True):
         torch.testing.assert_close(fast, naive, rtol=1e-9, atol=1e-10)
+
+
+@pytest.mark.parametrize("slab", [1, 7, 8192])
+def test_folded_group_norm_equals_the_plain_network(slab, monkeypatch, generator):
+    """Values and gradients, however the edges are cut into slabs."""
+    monkeypatch.setattr(edges, "_ROWS", slab)
+    torch.manual_seed(0)
+    network = NeighborhoodNet(16).double()
+    cloud = torch.randn(2, 9, 6, dtype=torch.float64, generator=generator)
+    around = neighborhoods(cloud, 1.5, 5)
+    pull = torch.randn(2, 9, 16, dtype=torch.float64, generator=generator)
+    found = []
+    for value in (network(around), neighborhood_net(around.features(), network)):
+        network.zero_grad()
+        (value * pull).sum().backward()
+        found.append([value, *(p.grad.clone() for p in network.parameters())])
+    for fast, naive in zip(*found, strict=True):
+        torch.testing.assert_close(fast, naive, rtol=1e-8, atol=1e-9)
 
 
 def test_ties_give_their_gradient_once():
     """Two equal neighbours: the maximum's gradient goes to one of them, not to both."""
     torch.manual_seed(0)
-    layer = FoldedNormLinear(3, 4).double().eval()
-    rows = torch.randn(1, 6, 3, dtype=torch.float64).expand(2, -1, -1).clone().requires_grad_()
-    layer(rows)[1].sum().backward()
-    assert (rows.grad[1] == 0).all()
-    assert (rows.grad[0] != 0).any()
+    layer = EdgeConvolution(3, 4).double().eval()
+    rows = torch.randn(1, 6, 1, 3, dtype=torch.float64).expand(-1, -1, 2, -1).clone()
+    layer(rows.requires_grad_(), None).top.sum().backward()
+    given = (rows.grad != 0).any(-1)
+    assert given.any(-1).any()
+    assert not given.all(-1).any()
 
 
 def test_edges_are_neighbour_then_centre(generator):
     points = torch.randn(2, 6, 3, generator=generator)
     neighbors = knn(points, 3)
     assert torch.equal(neighbors[..., 0], torch.arange(6).expand(2, -1))  # itself is nearest
-    edges = edge_features(points, neighbors).view(3, 2, 6, 6)
-    assert torch.equal(edges[2, 1, 4], torch.cat([points[1, neighbors[1, 4, 2]], points[1, 4]]))
+    rows = edge_features(points, neighbors).view(2, 6, 3, 6)
+    assert torch.equal(rows[1, 4, 2], torch.cat([points[1, neighbors[1, 4, 2]], points[1, 4]]))
 
 
 def test_knn_of_too_small_a_cloud_says_so():
@@ -126,3 +164,26 @@ def test_the_papers_network_has_its_size():
     assert DGCNN().k == 20
     assert DCP().optimizer.lr == 1e-3
     assert set(METHODS) >= {"DCP", "DCP_corr"}
+
+
+@pytest.mark.parametrize("name", sorted(METHODS))
+def test_a_step_in_bfloat16_is_near_the_one_in_float32(name, generator):
+    """What must be exact stays in float32: the loss agrees as far as bfloat16 features do."""
+    torch.manual_seed(0)
+    method = METHODS[name](METHODS[name].network_type(**TINY[name.removesuffix("_corr")]))
+    method.log = lambda *args, **options: None
+    target = torch.randn(2, 24, 6, generator=generator)
+    target[..., 3:] /= target[..., 3:].norm(dim=-1, keepdim=True)
+    rotation = torch.eye(3).expand(2, -1, -1)
+    match = torch.arange(20).expand(2, -1)
+    source = target[:, :20]
+    batch = PairBatch(
+        source, target, rotation, torch.zeros(2, 3), match, source[..., :3], torch.zeros(2).long()
+    )
+    exact = method.training_step(batch, 0)
+    with torch.autocast("cpu", torch.bfloat16):
+        rough = method.training_step(batch, 0)
+    rough.backward()
+    assert rough.dtype == torch.float32
+    torch.testing.assert_close(rough, exact, rtol=0.05, atol=0.02)
+    assert all(p.grad is None or p.grad.isfinite().all() for p in method.parameters())

@@ -6,7 +6,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from corrmat.networks.dgcnn import FoldedNormLinear
+from corrmat.networks.dgcnn import EdgeConvolution
+from corrmat.networks.edges import Edges, Moments
 
 
 def procrustes_loop(source: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
@@ -30,12 +31,19 @@ def cross_entropy_by_one_hot(f_x: Tensor, f_y: Tensor, scale: float, index: Tens
     return -torch.log((c * one_hot).sum(-1))
 
 
-class PlainNormLinear(FoldedNormLinear):
+class PlainEdgeConvolution(EdgeConvolution):
     """Linear, batch norm, ReLU, maximum: four passes over the edges."""
 
-    def forward(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        out = F.relu(self.norm(self.linear(rows).flatten(0, 1))).view(*rows.shape[:2], -1)
-        return out, out.max(0).values
+    def forward(self, rows: Tensor, seen: Moments | None, last: bool = False) -> Edges:
+        out = F.relu(self.norm(self.linear(rows).flatten(0, 2))).view(*rows.shape[:3], -1)
+        return Edges(None if last else out, out.amax(2), seen)
+
+
+def neighborhood_net(rows: Tensor, network) -> Tensor:
+    """RPMNet's features of neighbourhoods (B, N, K, 10) as written: every layer over all edges."""
+    edges = rows.permute(0, 3, 1, 2)
+    top = network.edge(edges.flatten(2)).unflatten(2, edges.shape[2:]).amax(3)
+    return F.normalize(network.out(network.point(top)).mT, dim=-1)
 
 
 def attention(x: Tensor, memory: Tensor, layer) -> Tensor:

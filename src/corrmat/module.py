@@ -104,7 +104,9 @@ class RegistrationModule(L.LightningModule):
     def configure_optimizers(self) -> Any:  # noqa: ANN401 (Lightning's many forms)
         """Adam with the schedule of the settings."""
         how = self.optimizer
-        adam = torch.optim.Adam(self.parameters(), how.lr, weight_decay=how.weight_decay)
+        adam = torch.optim.Adam(
+            self.parameters(), how.lr, weight_decay=how.weight_decay, fused=True
+        )
         if how.schedule == "step":
             rate = torch.optim.lr_scheduler.MultiStepLR(adam, list(how.milestones), how.gamma)
             return {"optimizer": adam, "lr_scheduler": {"scheduler": rate, "interval": "epoch"}}

@@ -19,13 +19,14 @@ class Neighborhoods(NamedTuple):
 
     def moved(self, rotation: Tensor, translation: Tensor) -> "Neighborhoods":
         """The neighbourhoods after `R @ x + t`, rotation (B, 3, 3) and translation (B, 3)."""
-        offset = (self.offset.flatten(1, 2) @ rotation.mT).view_as(self.offset)
+        still = torch.zeros_like(translation)
+        offset = rigid.apply(rotation, still, self.offset.flatten(1, 2)).view_as(self.offset)
         return Neighborhoods(rigid.apply(rotation, translation, self.centre), offset, self.ppf)
 
     def features(self) -> Tensor:
-        """(B, 10, N, K): centre, offset, ppf."""
+        """(B, N, K, 10): centre, offset, ppf."""
         centre = self.centre.unsqueeze(2).expand_as(self.offset)
-        return torch.cat([centre, self.offset, self.ppf], -1).permute(0, 3, 1, 2).contiguous()
+        return torch.cat([centre, self.offset, self.ppf], -1)
 
 
 @torch.no_grad()

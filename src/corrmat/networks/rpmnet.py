@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from corrmat.networks.edges import top_of_mlp
 from corrmat.networks.pointnet import shared_mlp
 from corrmat.networks.ppf import Neighborhoods, neighborhoods
 from corrmat.ops import rigid
@@ -87,9 +88,8 @@ class NeighborhoodNet(nn.Module):
 
     def forward(self, around: Neighborhoods) -> Tensor:
         """Features (B, N, d) of length one."""
-        edges = around.features()
-        top = self.edge(edges.flatten(2)).unflatten(2, edges.shape[2:]).amax(3)
-        return F.normalize(self.out(self.point(top)).mT, dim=-1)
+        top = top_of_mlp(around.features(), self.edge)
+        return F.normalize(self.out(self.point(top.mT)).mT, dim=-1)
 
 
 class AnnealingNet(nn.Module):

@@ -31,13 +31,16 @@ def identity(points: Tensor) -> tuple[Tensor, Tensor]:
 def compose(outer: tuple[Tensor, Tensor], inner: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     """The motion that applies `inner` first and `outer` second; each is ((..., 3, 3), (..., 3))."""
     rotation, translation = outer
-    return rotation @ inner[0], apply(rotation, translation, inner[1].unsqueeze(-2)).squeeze(-2)
+    with torch.autocast(rotation.device.type, enabled=False):
+        turned = rotation @ inner[0]
+    return turned, apply(rotation, translation, inner[1].unsqueeze(-2)).squeeze(-2)
 
 
 def invert(rotation: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
     """The motion that undoes ((..., 3, 3), (..., 3))."""
     inverse = rotation.mT
-    return inverse, -(inverse @ translation.unsqueeze(-1)).squeeze(-1)
+    with torch.autocast(rotation.device.type, enabled=False):
+        return inverse, -(inverse @ translation.unsqueeze(-1)).squeeze(-1)
 
 
 def axis_angle_to_matrix(axis: Tensor, angle_rad: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from corrmat.ops.streaming import softmax_rows
+from corrmat.ops.streaming import small, softmax_rows
 
 Slack = Literal["row", "both", "none"]
 
@@ -35,18 +35,23 @@ def sinkhorn_potentials(
         u (B, N) and v (B, M): the logarithm of the matrix is a_i . b_j - u_i - v_j.
     """
     u, v = a[..., 0] * 0, b[..., 0] * 0
+    scores = a @ b.mT if small(a, b) else None  # once for all iterations, where it may exist
+    back = None if scores is None else scores.mT
     for _ in range(iterations):
         if slack == "row":
-            v = _log_sum_exp(b, a, u, slack=True)
-            u = _log_sum_exp(a, b, v, slack=False)
+            v = _log_sum_exp(b, a, u, back, slack=True)
+            u = _log_sum_exp(a, b, v, scores, slack=False)
         else:
-            u = _log_sum_exp(a, b, v, slack=slack == "both")
-            v = _log_sum_exp(b, a, u, slack=slack == "both")
+            u = _log_sum_exp(a, b, v, scores, slack=slack == "both")
+            v = _log_sum_exp(b, a, u, back, slack=slack == "both")
     return u, v
 
 
-def _log_sum_exp(a: Tensor, b: Tensor, v: Tensor, slack: bool) -> Tensor:
+def _log_sum_exp(a: Tensor, b: Tensor, v: Tensor, scores: Tensor | None, slack: bool) -> Tensor:
     """Log sum_j exp(a_i . b_j - v_j) [+ exp(0)], (B, N)."""
+    if scores is not None:
+        total = (scores - v.unsqueeze(1)).logsumexp(2)
+        return torch.logaddexp(total, torch.zeros_like(total)) if slack else total
     lowered = torch.cat([b, v.unsqueeze(-1)], -1)
     last = a[..., 0] * 0 if slack else None
     total, _ = softmax_rows(F.pad(a, (0, 1), value=-1.0), lowered, b[..., :0], last)

@@ -13,6 +13,11 @@ _DENSE = 2**22  # entries of a matrix that is made whole
 _SLICE = 2**21  # entries of a larger one that exist at once
 
 
+def small(f_x: Tensor, f_y: Tensor) -> bool:
+    """Whether the whole matrix of dot products may be made."""
+    return f_x.shape[0] * f_x.shape[1] * f_y.shape[1] <= _DENSE
+
+
 def softmax_rows(
     f_x: Tensor, f_y: Tensor, values: Tensor, last: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
@@ -30,7 +35,7 @@ def softmax_rows(
     Returns:
         (B, N) log-sum-exp and (B, N, V) means.
     """
-    if f_x.shape[0] * f_x.shape[1] * f_y.shape[1] > _DENSE:
+    if not small(f_x, f_y):
         return _SoftmaxRows.apply(f_x, f_y, values, last)  # type: ignore[no-any-return]
     scores = f_x @ f_y.mT
     if last is not None:
