@@ -1,10 +1,11 @@
-"""Speed and memory of what costs: pairs a second, and a training step of every network.
+"""Speed and memory of what costs, beside naive twins, and how both grow with the clouds.
 
-    make bench        a table on the screen and in results/bench/bench.json
+    make bench        a table on the screen, results/bench/bench.json and results/bench/growth.png
 
-Times are medians after a warm-up, memory is the peak of a process of its own above what it held
-before its first step. DCP's naive twin is the same network with plain batch-norm passes over the
-edges; both run in one process, so the ratio holds on a noisy machine.
+Times are medians after a warm-up; memory is the peak of a process of its own above what it held
+before its first step. A ratio says how many times longer the naive twin takes, in the same process,
+turn by turn, so that it holds on a noisy machine. The twins are in tests/twins.py: the same values
+in the released formulation (NCHW edges, whole matrices, an SVD a pair, target features anew).
 """
 
 import json
@@ -13,94 +14,267 @@ import resource
 import statistics
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
+import numpy as np
 import torch
+from matplotlib import pyplot as plt
+from torch.utils.flop_counter import FlopCounterMode
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 
-from twins import PlainEdgeConvolution  # noqa: E402
+import twins  # noqa: E402  # pyright: ignore[reportMissingImports]
 
+from corrmat.aligners import CLASSICAL  # noqa: E402
 from corrmat.data import shapes  # noqa: E402
 from corrmat.data.pairs import Key, PairSettings, make_pairs  # noqa: E402
-from corrmat.losses import correspondence_loss  # noqa: E402
+from corrmat.errors import CorrmatError  # noqa: E402
+from corrmat.experiment import keep_freed_memory  # noqa: E402
+from corrmat.losses import chamfer_loss, correspondence_loss  # noqa: E402
 from corrmat.methods import METHODS  # noqa: E402
 from corrmat.ops import streaming  # noqa: E402
-from corrmat.ops.correspondence import SoftCorrespondence  # noqa: E402
+from corrmat.ops.correspondence import SinkhornCorrespondence, SoftCorrespondence  # noqa: E402
+from corrmat.ops.neighbors import within_radius  # noqa: E402
+from corrmat.ops.rigid import procrustes  # noqa: E402
 from corrmat.types import PairBatch  # noqa: E402
 
+Row = dict[str, Any]
 DCP_LAPTOP = {"width": 128, "feedforward": 256, "edge_channels": (32, 32, 64, 128), "k": 6}
 RPMNET_LAPTOP = {"width": 32, "k": 32, "annealing_width": 256}
 # method, hyper-parameters, points, batch
 STEPS: tuple[tuple[str, dict[str, Any], int, int], ...] = (
-    *(("DCP_corr", DCP_LAPTOP, n, 4) for n in (128, 256, 512, 1024)),
+    ("DCP_corr", DCP_LAPTOP, 128, 4),
     ("DCP_corr", {}, 512, 16),
+    ("DCP_corr", {}, 4096, 1),
     ("RPMNet_corr", RPMNET_LAPTOP, 256, 2),
     ("RPMNet_corr", {}, 1024, 4),
     ("PCRNet_corr", {}, 100, 32),
     ("PCRNet_corr", {}, 1024, 32),
     ("PCRNet", {}, 100, 8),
 )
+POINTS = (256, 512, 1024, 2048, 4096, 8192, 16384)
+GROWTH = {"DCP_corr, a step": POINTS, "RPMNet_corr, a step": POINTS[:5], "loss and pose": POINTS}
 
 
 def main() -> None:
     """Measure, print, write."""
-    rows = [{"what": "pairs, N=512, one core", **pairs_a_second()}]
-    print(format_row(rows[0]), flush=True)
+    rows: list[Row] = []
+
+    def add(what: str, row: Row) -> None:
+        rows.append({"what": what, **row})
+        figures = "  ".join(f"{name} {value}" for name, value in row.items())
+        print(f"{what:58s} {figures}", flush=True)
+
+    peak = in_a_process(matmul_peak)["gflops"]
+    add("matrix product 2048^3, float32", {"gflops": peak})
+    add("pairs, N=512, one core", in_a_process(pairs_a_second))
     for method, hparams, n, batch in STEPS:
         size = "laptop network" if hparams else "paper's network"
-        row = {"what": f"{method}, {size}, N={n}, batch {batch}"}
-        row |= in_a_process(training_step, method, hparams, n, batch)
-        if method == "DCP_corr":
-            row |= in_a_process(against_naive, hparams, n, min(batch, 4))
-        rows.append(row)
-        print(format_row(row), flush=True)
+        row = in_a_process(training_step, method, hparams, n, batch)
+        row["peak_share"] = round(row.pop("gflop_a_pair") / row["ms_a_pair"] * 1e3 / peak, 2)
+        if method in ("DCP_corr", "RPMNet_corr"):
+            few = min(batch, 4)
+            row |= in_a_process(against_released, method, hparams, n, few)
+        add(f"step of {method}, {size}, N={n}, batch {batch}", row)
+    for method in ("DCP_corr", "RPMNet_corr", "PCRNet_corr"):
+        add(f"one pair through {method}, N=1024", in_a_process(inference, method))
+    add("one pair through FPFH + RANSAC, N=1024", in_a_process(classical, "ransac"))
+    for name in TWINS:
+        add(f"{name}, value and gradient", in_a_process(against_twin, name))
     for n in (512, 2048, 8192):
-        row = {"what": f"correspondence loss and pose, d=512, N={n}, streamed"}
-        row |= in_a_process(against_dense, n)
-        rows.append(row)
-        print(format_row(row), flush=True)
-    path = ROOT / "results" / "bench" / "bench.json"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    found = {"threads": torch.get_num_threads(), "torch": torch.__version__, "rows": rows}
-    path.write_text(json.dumps(found, indent=1) + "\n")
-    print(f"written: {path.relative_to(ROOT)}")
+        add(f"loss and pose, d=512, N={n}, streamed", in_a_process(against_dense, n))
+    growth: dict[str, list[Row]] = {what: [] for what in GROWTH}
+    for what, sizes in GROWTH.items():
+        for n in sizes:
+            row = in_a_process(grown, what, n)
+            growth[what].append({"n": n, **row})
+            add(f"{what}, one pair, N={n}", row)
+    exponents = {what: fitted(found) for what, found in growth.items()}
+    for what, found in exponents.items():
+        print(f"{what}: time ~ N^{found['seconds']}, memory ~ N^{found['peak_mb']}, N >= 1024")
+    place = ROOT / "results" / "bench"
+    place.mkdir(parents=True, exist_ok=True)
+    about = {"threads": torch.get_num_threads(), "torch": torch.__version__}
+    found = {**about, "rows": rows, "growth": growth, "exponents": exponents}
+    (place / "bench.json").write_text(json.dumps(found, indent=1) + "\n")
+    draw(growth, exponents, place / "growth.png")
+    print(f"written: {place.relative_to(ROOT)}/bench.json, growth.png")
 
 
-def pairs_a_second() -> dict[str, float]:
+def matmul_peak() -> Row:
+    """What this machine's matrix products reach."""
+    a, b = torch.randn(2, 2048, 2048)
+    return {"gflops": round(2 * 2048**3 / median([lambda: a @ b], 9)[0] / 1e9)}
+
+
+def pairs_a_second() -> Row:
     """Pairs a second on one core, identical sampling, N = 512."""
-    threads = torch.get_num_threads()
     torch.set_num_threads(1)
     clouds, how = shapes.load("test", 32), PairSettings(num_points=512)
     keys = [Key(0, 0, 0, i) for i in range(16)]
-    seconds = median(lambda: make_pairs(clouds, range(16), keys, how), repeats=100)
-    torch.set_num_threads(threads)
-    return {"pairs_a_second": round(16 / seconds)}
+    seconds = median([lambda: make_pairs(clouds, range(16), keys, how)], 100)[0]
+    return {"pairs_a_second": round(16 / seconds), "ms_a_pair": round(1e3 * seconds / 16, 3)}
 
 
-def training_step(method: str, hparams: dict[str, Any], n: int, batch: int) -> dict[str, float]:
-    """Milliseconds a pair of a training step, and its peak memory."""
-    pairs, step = build(method, hparams, n, batch)
+def training_step(method: str, hparams: dict[str, Any], n: int, batch: int) -> Row:
+    """Milliseconds and billions of operations a pair of a training step, and its peak memory."""
+    pairs, module, step = build(method, hparams, n, batch)
     held = peak_mb()
-    seconds = median(step, repeats=3 if n * batch > 2000 else 20)
-    return {"ms_a_pair": round(1e3 * seconds / len(pairs), 1), "peak_mb": round(peak_mb() - held)}
+    seconds = median([lambda: step(ours(module, pairs))], 3 if n * batch > 2000 else 20)[0]
+    used = peak_mb() - held
+    with FlopCounterMode(display=False) as counter:
+        step(ours(module, pairs))
+    return {
+        "ms_a_pair": round(1e3 * seconds / batch, 1),
+        "peak_mb": round(used),
+        "gflop_a_pair": counter.get_total_flops() / batch / 1e9,
+    }
 
 
-def against_naive(hparams: dict[str, Any], n: int, batch: int) -> dict[str, float]:
-    """How many times longer DCP's naive twin takes."""
-    seconds = []
-    for naive in (False, True):
-        _, step = build("DCP_corr", hparams, n, batch, naive)
-        seconds.append(median(step, repeats=5))
-    return {"naive_ratio": round(seconds[1] / seconds[0], 2)}
+def against_released(method: str, hparams: dict[str, Any], n: int, batch: int) -> Row:
+    """How many times longer a step in the released formulation takes, and its peak memory."""
+    pairs, module, step = build(method, hparams, n, batch)
+    held = peak_mb()
+
+    def released() -> torch.Tensor:
+        if method == "DCP_corr":
+            *_, c = twins.released_dcp(module.network, pairs.source, pairs.target)
+            return twins.one_hot_loss(c, pairs.match)
+        *_, matrices = twins.released_rpmnet(module.network, pairs.source, pairs.target)
+        return torch.stack([twins.one_hot_loss(c, pairs.match) for c in matrices]).sum()
+
+    both = [lambda: step(ours(module, pairs)), lambda: step(released())]
+    own, other = median(both, 1 if n * batch > 2000 else 9)
+    return {"released_ratio": round(other / own, 2), "released_peak_mb": round(peak_mb() - held)}
 
 
-def against_dense(n: int) -> dict[str, float]:
+@torch.no_grad()
+def inference(method: str) -> Row:
+    """Milliseconds from one pair to its motion; the released formulation where there is a twin."""
+    pairs, module, _ = build(method, {}, 1024, 1)
+    module.eval()
+    both: list[Callable[[], object]] = [lambda: module(pairs.source, pairs.target)]
+    twin = {"DCP_corr": twins.released_dcp, "RPMNet_corr": twins.released_rpmnet}.get(method)
+    if twin:
+        both.append(lambda: twin(module.network, pairs.source, pairs.target))
+    own, *other = median(both, 5)
+    return {"ms": round(1e3 * own, 1)} | (
+        {"released_ratio": round(other[0] / own, 2)} if other else {}
+    )
+
+
+def classical(name: str) -> Row:
+    """Milliseconds of a classical pipeline on one pair; nothing where Open3D is missing."""
+    pairs, *_ = build("PCRNet_corr", {}, 1024, 1)
+    source, target = pairs.source[0].double().numpy(), pairs.target[0].double().numpy()
+    try:
+        return {"ms": round(1e3 * median([lambda: CLASSICAL[name](source, target, 0)], 5)[0], 1)}
+    except CorrmatError as error:
+        return {"not_measured": str(error)}
+
+
+def against_twin(name: str) -> Row:
+    """How many times longer an operation's naive twin takes."""
+    torch.manual_seed(0)
+    fast, naive = TWINS[name]()
+    own, other = median([fast, naive], 5)
+    return {"ms": round(1e3 * own, 1), "naive_ratio": round(other / own, 2)}
+
+
+def _pulled(work: Callable[..., Any], *inputs: torch.Tensor) -> Callable[[], None]:
+    leaves = [t.clone().requires_grad_() for t in inputs]
+
+    def run() -> None:
+        found = work(*leaves)
+        found = found if isinstance(found, tuple) else (found,)
+        torch.cat([t.flatten() for t in found]).sum().backward()
+
+    return run
+
+
+def _procrustes() -> tuple[Callable[[], object], ...]:
+    x, y = torch.randn(2, 16, 512, 3)
+    w = torch.rand(16, 512)
+    return tuple(_pulled(work, x, y, w) for work in (procrustes, twins.procrustes_loop))
+
+
+def _ball_query() -> tuple[Callable[[], object], ...]:
+    points = torch.rand(4, 1024, 3)
+    queries = (within_radius, twins.ball_query_by_sorting)
+    return tuple(lambda work=work: work(points, 0.3, 64) for work in queries)
+
+
+def _chamfer() -> tuple[Callable[[], object], ...]:
+    x, y = torch.rand(2, 8, 1024, 3)
+    return tuple(_pulled(work, x, y) for work in (chamfer_loss, twins.chamfer_loss_dense))
+
+
+def _sinkhorn() -> tuple[Callable[[], object], ...]:
+    f_x, f_y = torch.nn.functional.normalize(torch.randn(2, 2, 1024, 96), dim=-1)
+    beta, alpha = torch.full((2,), 5.0), torch.ones(2)
+
+    def fast(f_x: torch.Tensor, f_y: torch.Tensor) -> torch.Tensor:
+        return SinkhornCorrespondence(f_x, f_y, beta, alpha, 5, "row").weight()
+
+    def naive(f_x: torch.Tensor, f_y: torch.Tensor) -> torch.Tensor:
+        distance = (f_x.unsqueeze(2) - f_y.unsqueeze(1)).square().sum(-1)
+        affinity = -beta[:, None, None] * (distance - alpha[:, None, None])
+        return twins.sinkhorn_padded(affinity, 5, "row").exp().sum(2)
+
+    return tuple(_pulled(work, f_x, f_y) for work in (fast, naive))
+
+
+def _cross_entropy() -> tuple[Callable[[], object], ...]:
+    f_x, f_y = torch.randn(2, 4, 1024, 512)
+    match, scale = torch.arange(1024).expand(4, -1), 512**-0.5
+    return (
+        _pulled(lambda a, b: SoftCorrespondence(a, b, scale).nll(match), f_x, f_y),
+        _pulled(lambda a, b: twins.cross_entropy_by_one_hot(a, b, scale, match), f_x, f_y),
+    )
+
+
+TWINS: dict[str, Callable[[], tuple[Callable[[], object], ...]]] = {
+    "Procrustes, 16 pairs of 512": _procrustes,
+    "neighbours within a radius, 4 clouds of 1024": _ball_query,
+    "Chamfer distance, 8 pairs of 1024": _chamfer,
+    "Sinkhorn, 2 pairs of 1024": _sinkhorn,
+    "cross-entropy, 4 pairs of 1024, d=512": _cross_entropy,
+}
+
+
+def against_dense(n: int) -> Row:
     """Milliseconds of loss, pose and gradient, how many times longer the whole matrix takes."""
+    step = _loss_and_pose(n)
+
+    def on(most: int) -> None:
+        streaming._DENSE = most  # entries up to which the matrix is made whole
+        step()
+
+    own, other = median([lambda: on(0), lambda: on(n * n)], 3)
+    return {"ms": round(1e3 * own, 1), "dense_ratio": round(other / own, 2)}
+
+
+def grown(what: str, n: int) -> Row:
+    """Seconds and peak memory of one pair of N points."""
+    if what == "loss and pose":
+        run = _loss_and_pose(n)
+    else:
+        pairs, module, step = build(what.split(",")[0], {}, n, 1)
+
+        def run() -> None:
+            step(ours(module, pairs))
+
+    held = peak_mb()
+    seconds = median([run], 1 if n > 2048 else 3, warm=n <= 8192)[0]
+    return {"seconds": round(seconds, 4), "peak_mb": round(peak_mb() - held)}
+
+
+def _loss_and_pose(n: int) -> Callable[[], None]:
     torch.manual_seed(0)
     f_x, f_y = (torch.randn(1, n, 512).requires_grad_() for _ in range(2))
     y, match = torch.randn(1, n, 3), torch.arange(n).unsqueeze(0)
@@ -109,42 +283,72 @@ def against_dense(n: int) -> dict[str, float]:
         c = SoftCorrespondence(f_x, f_y, 512**-0.5)
         (c.soft_target(y).sum() + correspondence_loss(c, match)).backward()
 
-    seconds, held = [], peak_mb()
-    for most in (0, n * n):  # entries up to which the matrix is made whole
-        streaming._DENSE = most
-        seconds.append(median(step, repeats=3))
-        if not most:
-            used = peak_mb() - held
-    return {
-        "ms": round(1e3 * seconds[0], 1),
-        "peak_mb": round(used),
-        "dense_ratio": round(seconds[1] / seconds[0], 2),
-    }
+    return step
+
+
+def fitted(found: list[Row]) -> dict[str, float | None]:
+    """Exponents of time and memory against N, by least squares over N of at least 1024."""
+    large = [row for row in found if row["n"] >= 1024]
+    exponents: dict[str, float | None] = {}
+    for name in ("seconds", "peak_mb"):
+        known = [(row["n"], row[name]) for row in large if row[name] > 0]
+        slope = np.polyfit(*np.log(known).T, 1)[0] if len(known) > 1 else None
+        exponents[name] = None if slope is None else round(float(slope), 2)
+    return exponents
+
+
+def draw(growth: dict[str, list[Row]], exponents: dict[str, Any], path: Path) -> None:
+    """Time and memory against N, on doubly logarithmic axes."""
+    mpl.use("Agg")
+    figure, panels = plt.subplots(1, 2, figsize=(9, 4), layout="constrained")
+    for axes, name, title in zip(
+        panels, ("seconds", "peak_mb"), ("seconds a pair", "peak memory, MB"), strict=True
+    ):
+        for what, found in growth.items():
+            known = [(row["n"], row[name]) for row in found if row[name] > 0]
+            axes.loglog(*zip(*known, strict=True), "o-", label=f"{what}: N^{exponents[what][name]}")
+        axes.set(xlabel="points N of either cloud", title=title)
+        axes.set_xticks(POINTS, [str(n) for n in POINTS], minor=False)
+        axes.tick_params(axis="x", which="minor", bottom=False, labelbottom=False)
+        axes.grid(alpha=0.3)
+        axes.legend(frameon=False, fontsize=8)
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
 
 
 def build(
-    method: str, hparams: dict[str, Any], n: int, batch: int, naive: bool = False
-) -> tuple[PairBatch, Callable[[], None]]:
-    """Pairs, and a function that does one training step on them."""
+    method: str, hparams: dict[str, Any], n: int, batch: int
+) -> tuple[PairBatch, Any, Callable[[torch.Tensor], None]]:
+    """Pairs of N points (of an ellipsoid if N is large), a method, a step of its optimizer."""
     torch.manual_seed(0)
-    keys = [Key(0, 0, 0, i) for i in range(batch)]
-    pairs = make_pairs(shapes.load("test", batch), range(batch), keys, PairSettings(num_points=n))
-    network_type = METHODS[method].network_type
-    module = METHODS[method](network_type(**hparams))
-    adam = torch.optim.Adam(module.parameters(), 1e-4)
-    if naive:
-        for layer in module.network.embed.edge:  # type: ignore[union-attr]
-            layer.__class__ = PlainEdgeConvolution
+    keep_freed_memory()
+    module: Any = METHODS[method](METHODS[method].network_type(**hparams))
+    if n <= shapes.load("test", 1).points.shape[1]:
+        keys = [Key(0, 0, 0, i) for i in range(batch)]
+        how = PairSettings(num_points=n)
+        pairs = make_pairs(shapes.load("test", batch), range(batch), keys, how)
+    else:
+        cloud = torch.nn.functional.normalize(torch.randn(batch, n, 3), dim=-1)
+        rows = torch.cat([cloud * torch.tensor([1.0, 0.7, 0.4]), cloud], -1)
+        truth = torch.eye(3).expand(batch, 3, 3), torch.zeros(batch, 3)
+        match = torch.arange(n).expand(batch, -1)
+        pairs = PairBatch(rows, rows, *truth, match, rows[..., :3], torch.zeros(batch).long())
+    adam = torch.optim.Adam(module.parameters(), 1e-4, fused=True)
 
-    def step() -> None:
+    def step(loss: torch.Tensor) -> None:
         adam.zero_grad()
-        module.loss(module(pairs.source, pairs.target), pairs).backward()
+        loss.backward()
         adam.step()
 
-    return pairs, step
+    return pairs, module, step
 
 
-def in_a_process(work: Callable[..., dict[str, float]], *arguments: Any) -> dict[str, float]:  # noqa: ANN401
+def ours(module: Any, pairs: PairBatch) -> torch.Tensor:  # noqa: ANN401
+    """The method's loss on these pairs."""
+    return module.loss(module(pairs.source, pairs.target), pairs)
+
+
+def in_a_process(work: Callable[..., Row], *arguments: Any) -> Row:  # noqa: ANN401
     """Run in a fresh process, whose peak of memory is its own."""
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=context) as pool:
@@ -157,21 +361,16 @@ def peak_mb() -> float:
     return size / 2**20 if sys.platform == "darwin" else size / 2**10
 
 
-def median(work: Callable[[], object], repeats: int) -> float:
-    """Median seconds of a call, after two that do not count."""
-    seconds = []
-    for turn in range(repeats + 2):
-        start = time.perf_counter()
-        work()
-        if turn >= 2:
-            seconds.append(time.perf_counter() - start)
-    return statistics.median(seconds)
-
-
-def format_row(row: dict) -> str:
-    """One line of the table."""
-    figures = "  ".join(f"{k} {v}" for k, v in row.items() if k != "what")
-    return f"{row['what']:52s} {figures}"
+def median(works: Sequence[Callable[[], object]], repeats: int, warm: bool = True) -> list[float]:
+    """Median seconds of each call, turn by turn, after one turn that does not count."""
+    seconds: list[list[float]] = [[] for _ in works]
+    for turn in range(repeats + warm):
+        for work, times in zip(works, seconds, strict=True):
+            start = time.perf_counter()
+            work()
+            if turn >= warm:
+                times.append(time.perf_counter() - start)
+    return [statistics.median(times) for times in seconds]
 
 
 if __name__ == "__main__":

@@ -1,13 +1,17 @@
 """Naive twins: the plainest code that computes the same as a fast path."""
 
 import math
+from unittest import mock
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from corrmat.networks.dcp import DCPNetwork
 from corrmat.networks.dgcnn import EdgeConvolution
 from corrmat.networks.edges import Edges, Moments
+from corrmat.networks.ppf import point_pair_features
+from corrmat.networks.rpmnet import RPMNetwork
 
 
 def procrustes_loop(source: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
@@ -102,3 +106,82 @@ def chamfer_loss_dense(moved: Tensor, target: Tensor) -> Tensor:
     """The paper's CD over the whole distance matrix."""
     distance = (moved.unsqueeze(2) - target.unsqueeze(1)).norm(dim=-1)
     return distance.amin(2).mean() + distance.amin(1).mean()
+
+
+def ball_query_by_sorting(points: Tensor, radius: float, k: int) -> Tensor:
+    """Neighbours of lowest index from a sorted (B, N, N) array of indices, as released."""
+    n = points.shape[1]
+    away = torch.cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist") > radius
+    own = torch.arange(n)
+    away[:, own, own] = True
+    index = own.repeat(len(points), n, 1).masked_fill(away, n).sort(-1).values[..., :k]
+    return torch.where(index == n, own.view(1, n, 1), index)
+
+
+def released_dcp(network: DCPNetwork, source: Tensor, target: Tensor) -> tuple[Tensor, ...]:
+    """DCP in the released formulation: NCHW edges, whole attention matrices, an SVD a pair."""
+
+    def embed(points: Tensor) -> Tensor:
+        net, pooled = network.embed, []
+        index = torch.cdist(points, points).topk(net.k, largest=False).indices
+        batch = torch.arange(len(points)).view(-1, 1, 1)
+        x = torch.cat([points[batch, index], points.unsqueeze(2).expand(-1, -1, net.k, -1)], -1)
+        x = x.permute(0, 3, 1, 2).contiguous()
+        for layer in net.edge:
+            x = norm(F.conv2d(x, layer.linear.weight[..., None, None]), layer.norm)
+            pooled.append(x.max(-1, keepdim=True).values)
+        fused = norm(F.conv2d(torch.cat(pooled, 1), net.fuse.weight[..., None, None]), net.norm)
+        return fused.squeeze(-1).mT
+
+    def norm(x: Tensor, layer: torch.nn.BatchNorm1d) -> Tensor:
+        stats = layer.running_mean, layer.running_var
+        return F.relu(F.batch_norm(x, *stats, layer.weight, layer.bias, layer.training))
+
+    x, y = source[..., :3], target[..., :3]
+    f_x, f_y = embed(x), embed(y)
+    with mock.patch.object(F, "scaled_dot_product_attention", whole_attention):
+        f_x, f_y = f_x + network.pointer(f_x, f_y), f_y + network.pointer(f_y, f_x)
+    c = torch.softmax(f_x @ f_y.mT / math.sqrt(f_x.shape[-1]), -1)
+    return *procrustes_loop(x, c @ y, torch.ones_like(c[..., 0])), c
+
+
+def whole_attention(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+    """softmax(Q K^T / sqrt(d)) V, as written."""
+    return torch.softmax(q @ k.mT / math.sqrt(q.shape[-1]), -1) @ v
+
+
+def released_rpmnet(
+    network: RPMNetwork, source: Tensor, target: Tensor
+) -> tuple[Tensor, Tensor, list[Tensor]]:
+    """RPMNet in the released formulation: everything anew for both clouds every turn."""
+
+    def embed(cloud: Tensor, normals: Tensor) -> Tensor:
+        index = ball_query_by_sorting(cloud, network.radius, network.k)
+        batch = torch.arange(len(cloud)).view(-1, 1, 1)
+        offset = cloud[batch, index] - cloud.unsqueeze(2)
+        ppf = point_pair_features(offset, normals.unsqueeze(2), normals[batch, index])
+        rows = torch.cat([cloud.unsqueeze(2).expand_as(offset), offset, ppf], -1)
+        return neighborhood_net(rows, network.embed)
+
+    x, y, matrices = source[..., :3], target[..., :3], []
+    rotation, translation = torch.eye(3).expand(len(x), 3, 3).to(x), torch.zeros(len(x), 3).to(x)
+    for _ in range(network.iterations if network.training else network.test_iterations):
+        rotation, translation = rotation.detach(), translation.detach()
+        moved = x @ rotation.mT + translation.unsqueeze(1)
+        f_x = embed(moved, source[..., 3:] @ rotation.mT)
+        f_y = embed(y, target[..., 3:])
+        beta, alpha = network.annealing(moved, y)
+        distance = (f_x.unsqueeze(2) - f_y.unsqueeze(1)).square().sum(-1)
+        affinity = -beta[:, None, None] * (distance - alpha[:, None, None])
+        c = sinkhorn_padded(affinity, network.sinkhorn_iterations, network.slack).exp()
+        weight = c.sum(2)
+        matched = c @ y / weight.unsqueeze(2)
+        rotation, translation = procrustes_loop(x, matched, weight)
+        matrices.append(c)
+    return rotation, translation, matrices
+
+
+def one_hot_loss(c: Tensor, match: Tensor) -> Tensor:
+    """The cross-entropy of matrices (B, N, M) against one-hot matrices."""
+    labels = F.one_hot(match, c.shape[2]).to(c.dtype)
+    return -(labels * torch.log(c + 1e-30)).sum(2).mean()
