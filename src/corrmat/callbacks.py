@@ -1,7 +1,9 @@
-"""What happens beside the training step: the curve that figures show, and Ctrl-C."""
+"""What happens beside the training step: the curve that figures show, checkpoints, Ctrl-C."""
 
+import io
 import logging
 import math
+import os
 import signal
 import threading
 import time
@@ -11,8 +13,10 @@ from typing import Any
 import lightning as L
 import torch
 from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
 
+from corrmat.files import replace_bytes
 from corrmat.types import PairBatch
 
 SHOWN = (
@@ -48,7 +52,7 @@ class Curve(Callback):
         batch_idx: int,
     ) -> None:
         """Count."""
-        self.pairs += len(batch)
+        self.pairs += len(batch) * trainer.world_size
         self._losses.append(outputs["loss"].detach())
         if trainer.global_step >= trainer.estimated_stepping_batches:
             trainer.should_stop = True  # so that the last weights are validated too
@@ -63,7 +67,7 @@ class Curve(Callback):
             for k, v in trainer.callback_metrics.items()
             if k.startswith("val/")
         }
-        loss = float(torch.stack([x.cpu() for x in self._losses]).mean())
+        loss = float(trainer.strategy.reduce(torch.stack(self._losses).mean()))
         self._losses.clear()
         self.points.append({"pairs_seen": self.pairs, "loss": loss} | {k: values[k] for k in SHOWN})
         line = (
@@ -105,6 +109,26 @@ def _matches(share: float) -> str:
     return "" if math.isnan(share) else f"matches {100 * share:5.1f} %  "
 
 
+class WholeCheckpoints(TorchCheckpointIO):
+    """Checkpoints are written beside their place and moved in.
+
+    Lightning's own way goes through the folder of temporary files, which may lie on another
+    disk: a full disk or `kill -9` would then cost the checkpoint that was there.
+    """
+
+    def save_checkpoint(
+        self,
+        checkpoint: dict[str, Any],
+        path: str | os.PathLike[str],
+        storage_options: Any = None,  # noqa: ANN401 (Lightning's signature)
+    ) -> None:
+        """Write, then move in."""
+        content = io.BytesIO()
+        torch.save(checkpoint, content)
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        replace_bytes(Path(path), content.getbuffer())
+
+
 class SaveOnInterrupt(Callback):
     """Ctrl-C or SIGTERM leaves a checkpoint between two steps and says how to go on.
 
@@ -117,8 +141,11 @@ class SaveOnInterrupt(Callback):
         self._noted, self._hurried = False, False
         self._before: dict[signal.Signals, Any] = {}
 
-    def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Take over the signals, where that is possible."""
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Take over the signals, where that is possible, from Lightning, too.
+
+        Its own way with SIGTERM stops without a checkpoint, as if all had gone well.
+        """
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
                 self._before[number] = signal.signal(number, self._note)
@@ -136,15 +163,18 @@ class SaveOnInterrupt(Callback):
         """Lightning calls this before it gives up."""
         self._give_back()
         if isinstance(exception, KeyboardInterrupt):
-            if self._noted and not self._hurried:
+            if self._noted and not self._hurried and trainer.world_size == 1:
                 # The batch under way does not count, or later validations come one too early.
                 total = trainer.fit_loop.epoch_loop.batch_progress.total
                 total.ready = total.completed
                 trainer.save_checkpoint(self.path)
-            say(f"interrupted at step {trainer.global_step}; checkpoint: {self.path}")
-            say("the same command goes on from there")
+            if self.path.is_file():
+                say(f"interrupted at step {trainer.global_step}; checkpoint: {self.path}")
+                say("the same command goes on from there")
+            else:
+                say(f"interrupted at step {trainer.global_step}, before the first checkpoint")
 
-    def on_fit_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+    def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Give the signals back."""
         self._give_back()
 

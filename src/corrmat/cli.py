@@ -1,6 +1,7 @@
 """The command line: corrmat register, example, run, fit, evaluate, robustness, data, report."""
 
 import argparse
+import os
 import sys
 from pathlib import Path
 
@@ -85,6 +86,9 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("corrmat: interrupted; nothing was recorded", file=sys.stderr)
         return 1
+    except BrokenPipeError:  # whoever read our output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
 
 
 def reproduce(experiment: str) -> None:
@@ -177,6 +181,11 @@ def _experiment_options(command: argparse.ArgumentParser, name: str) -> None:
             choices=["none", "csv", "wandb"],
             default="wandb",
             help="wandb (default): CSV and wandb offline; csv; none. The record is written anyway",
+        )
+        command.add_argument(
+            "--fresh",
+            action="store_true",
+            help="train anew, even where a run of the same settings was interrupted or is done",
         )
         loud = command.add_mutually_exclusive_group()
         loud.add_argument("-q", "--quiet", action="store_true", help="print nothing but results")
@@ -299,10 +308,11 @@ def _experiment(known: argparse.Namespace, options: list[str]) -> int:
     wanted = getattr(known, "arm", None)
     arms = [wanted] if wanted else None
     experiment.quieten()
-    console.listen(getattr(known, "verbose", False) - getattr(known, "quiet", False))
+    loud = getattr(known, "verbose", False) - getattr(known, "quiet", False)
+    console.listen(loud if experiment.first_process() else -1)
     found = recipe.load(known.config, known.scale, options, arms)
     if known.command == "run":
-        experiment.run(found, known.results, known.runs, known.logger)
+        experiment.run(found, known.results, known.runs, known.logger, fresh=known.fresh)
         return 0
     name = next((arm for arm in found.settings if arm.endswith("_corr")), list(found.settings)[-1])
     arm = experiment.prepare(name, found.settings[name])
@@ -310,7 +320,7 @@ def _experiment(known: argparse.Namespace, options: list[str]) -> int:
     if known.command == "fit":
         group = f"{found.scale}/{found.data}/{found.id}"
         with console.Board() as board:
-            trained = experiment.train(arm, folder, group, known.logger, board)
+            trained = experiment.train(arm, folder, group, known.logger, board, fresh=known.fresh)
         print(f"best checkpoint: {trained.checkpoint}")
         return 0
     checkpoint = known.checkpoint or experiment.best_checkpoint(found, name, known.runs)

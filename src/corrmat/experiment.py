@@ -3,6 +3,7 @@
 import contextlib
 import ctypes
 import json
+import pickle
 import shutil
 import warnings
 import zlib
@@ -18,15 +19,16 @@ import torch
 import yaml
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.utilities import rank_zero_only
 from torch import Tensor
 
 from corrmat import logs, record, report
 from corrmat.baselines import BASELINES, UNTRAINED
-from corrmat.callbacks import Curve, SaveOnInterrupt, say
+from corrmat.callbacks import Curve, SaveOnInterrupt, WholeCheckpoints, say
 from corrmat.console import Board, Progress
 from corrmat.data.datamodule import RegistrationDataModule
 from corrmat.errors import CorrmatError
-from corrmat.files import replace_text
+from corrmat.files import ensure_writable, replace_text
 from corrmat.losses import CorrespondenceLoss
 from corrmat.methods import METHODS
 from corrmat.module import OptimizerSettings, RegistrationModule
@@ -75,7 +77,14 @@ def prepare(name: str, settings: Settings) -> Arm:
     return arm
 
 
-def run(recipe: Recipe, results: Path, runs: Path, logger: logs.Choice = "csv") -> dict[str, Any]:
+def run(
+    recipe: Recipe,
+    results: Path,
+    runs: Path,
+    logger: logs.Choice = "csv",
+    *,
+    fresh: bool = False,
+) -> dict[str, Any]:
     """Train and test every arm, and write the record at one stroke when all are done.
 
     Args:
@@ -83,19 +92,24 @@ def run(recipe: Recipe, results: Path, runs: Path, logger: logs.Choice = "csv") 
         results: folder of records; this one goes to <scale>/<data>/<id>.
         runs: folder of checkpoints and logs, the same below it.
         logger: see `logs.loggers`.
+        fresh: start anew where a run was interrupted or an arm is trained already.
 
     Returns:
-        The record, as in metrics.json.
+        The record, as in metrics.json; nothing in the further processes of a distributed run.
     """
     place = Path(recipe.scale, recipe.data, recipe.id)
+    for folder in (results / place, runs / place):
+        ensure_writable(folder)
     ready = [prepare(name, settings) for name, settings in recipe.settings.items()]
     scores, rows, views = {}, [], []
     with Board() as board:
         for arm in ready:
             say(f"\n{recipe.id} {arm.name} ({recipe.scale}, {recipe.data})")
             folder = runs / place / arm.name
-            trained = _reusable(recipe, arm, runs)
-            trained = trained or train(arm, folder, str(place), logger, board)
+            trained = None if fresh else _reusable(recipe, arm, runs)
+            trained = trained or train(arm, folder, str(place), logger, board, fresh=fresh)
+            if not first_process():  # the others of a distributed run are there to train
+                continue
             module = trained_module(arm, trained.checkpoint)
             tests, scored = _tested(module, arm, recipe)
             scores[arm.name] = scored | {
@@ -106,6 +120,8 @@ def run(recipe: Recipe, results: Path, runs: Path, logger: logs.Choice = "csv") 
             }
             rows += record.rows(arm.name, tests)
             views = views or _views(module, arm, tests, recipe)
+    if not first_process():
+        return {}
     baselines = {}
     for name in recipe.baselines:
         tests, baselines[name] = _tested(_baseline(name, ready[-1]), ready[-1], recipe)
@@ -140,6 +156,8 @@ def train(
     group: str = "",
     logger: logs.Choice = "csv",
     board: Board | None = None,
+    *,
+    fresh: bool = False,
 ) -> Trained:
     """Train one arm; goes on from an interrupted run of the same settings if there is one.
 
@@ -149,24 +167,27 @@ def train(
         group: wandb's name for the arms that belong together.
         logger: see `logs.loggers`.
         board: to show progress on.
+        fresh: start anew in any case.
 
     Raises:
-        CorrmatError: a loss that is no longer a number.
+        CorrmatError: a loss that is no longer a number; a full disk.
     """
     settings, datamodule = arm.settings, arm.datamodule
     module = _fresh(settings)
     stored, text = folder / "settings.yaml", training_settings(arm)
     last, done = folder / "last.ckpt", folder / "trained.json"
-    resume = last.is_file() and not done.is_file() and stored.read_text() == text
-    if resume:
-        datamodule.goes_on = _progress(last, datamodule)
-        say(f"going on from {last}")
-    else:
-        shutil.rmtree(folder, ignore_errors=True)
+    interrupted = stored.is_file() and not done.is_file() and stored.read_text() == text
+    start = _last_good(folder) if interrupted and not fresh else None
+    if start is None:
         size, shapes = sum(p.numel() for p in module.parameters()), datamodule.clouds("train")
         say(f"{size:,} parameters, {len(shapes)} training shapes")
-    folder.mkdir(parents=True, exist_ok=True)
-    stored.write_text(text)
+    if first_process():
+        if start is None:
+            shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True, exist_ok=True)
+        replace_text(stored, text)
+    else:
+        logger, board = "none", None
 
     curve = Curve()
     callbacks = [
@@ -182,9 +203,13 @@ def train(
     options["precision"] = options["precision"] or default_precision(options["accelerator"])
     keep_freed_memory()
     trainer = L.Trainer(**options, logger=made, callbacks=callbacks, default_root_dir=folder)
+    datamodule.trainer = trainer
+    if start is not None:
+        datamodule.goes_on = _progress(start, datamodule)
+        say(f"going on from {start}")
     try:
-        trainer.fit(module, datamodule, ckpt_path=last if resume else None, weights_only=True)
-    except CorrmatError as error:
+        trainer.fit(module, datamodule, ckpt_path=start, weights_only=True)
+    except (CorrmatError, OSError) as error:
         kept = last if last.is_file() else "none yet"
         raise CorrmatError(
             f"{error}; seed {settings.seed}; last good checkpoint: {kept}"
@@ -195,10 +220,16 @@ def train(
         say("training ended before the first validation: the last weights stand for the best")
         trainer.save_checkpoint(checkpoint)
     trained = Trained(checkpoint, curve.pairs, curve.seconds, record.commit(), curve.points)
-    replace_text(
-        done, json.dumps(asdict(trained) | {"checkpoint": trained.checkpoint.name}, indent=1)
-    )
+    if first_process():
+        replace_text(
+            done, json.dumps(asdict(trained) | {"checkpoint": trained.checkpoint.name}, indent=1)
+        )
     return trained
+
+
+def first_process() -> bool:
+    """Whether this process writes: the only one, or the first of those that train together."""
+    return not rank_zero_only.rank
 
 
 def trained_module(arm: Arm, checkpoint: Path) -> RegistrationModule:
@@ -233,8 +264,9 @@ def score(
     Returns:
         Per-pair values of each set.
     """
+    alone = {"devices": 1, "num_nodes": 1, "strategy": "auto"}
     quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
-    trainer = L.Trainer(**{**trainer_options(arm.settings), **quiet})
+    trainer = L.Trainer(**{**trainer_options(arm.settings), **alone, **quiet})
     found = []
     for changes in how:
         trainer.test(module, arm.datamodule.test_dataloader(**changes), verbose=False)
@@ -354,6 +386,8 @@ def trainer_options(settings: Settings) -> dict[str, Any]:
     """Keyword arguments of Lightning's Trainer."""
     options = settings.trainer.as_dict()
     options |= {"enable_model_summary": False, "enable_checkpointing": True}
+    options["use_distributed_sampler"] = False  # `EpochSampler` shares the pairs out
+    options["plugins"] = [WholeCheckpoints()]
     options["enable_progress_bar"] = bool(options.get("enable_progress_bar"))  # ours is the board
     if options["accelerator"] == "auto" and torch.backends.mps.is_available():
         options["accelerator"] = "cpu"  # Apple's GPUs lack the float64 that Procrustes needs
@@ -398,6 +432,19 @@ def training_settings(arm: Arm) -> str:
     rows = arm.datamodule.clouds("train").rows
     plain["data"]["checksum"] = f"{zlib.crc32(np.ascontiguousarray(rows).data):08x}"
     return yaml.safe_dump(plain, sort_keys=False)
+
+
+def _last_good(folder: Path) -> Path | None:
+    """The checkpoint to go on from: the last, or the best where the last was cut short."""
+    for checkpoint in (folder / "last.ckpt", folder / "best.ckpt"):
+        if checkpoint.is_file():
+            try:
+                torch.load(checkpoint, map_location="cpu", weights_only=True, mmap=True)
+            except (RuntimeError, OSError, ValueError, EOFError, pickle.UnpicklingError):
+                say(f"{checkpoint} cannot be read and is left out")
+            else:
+                return checkpoint
+    return None
 
 
 def _progress(checkpoint: Path, datamodule: RegistrationDataModule) -> dict[str, int]:

@@ -45,6 +45,7 @@ _NOT_TRAINER: set[str | int] = {  # ours to decide
     "plugins",
     "profiler",
     "model_registry",
+    "use_distributed_sampler",
 }
 
 

@@ -43,11 +43,19 @@ class PairDataset(Dataset[PairBatch]):
 class EpochSampler(Sampler[tuple[int, int]]):
     """Names the items of one epoch: every shape once, in a random order if `shuffle`.
 
+    Of W processes the r-th gets every W-th item from r on, so that their batches together are
+    those of one process with W times the batch. In training all get equally many, in validation
+    every item comes once.
+
     A run that goes on in the middle of an epoch leaves out the first `done` items, once.
     """
 
-    def __init__(self, size: int, seed: int, shuffle: bool, epoch: int = 0, done: int = 0) -> None:
+    def __init__(
+        self, size: int, seed: int, shuffle: bool, epoch: int = 0, done: int = 0,
+        share: tuple[int, int] = (0, 1),
+    ) -> None:  # fmt: skip
         self.size, self.seed, self.shuffle, self.epoch, self.done = size, seed, shuffle, epoch, done
+        self.rank, self.world = share
 
     def set_epoch(self, epoch: int) -> None:
         """Lightning calls this before every epoch; frozen pairs stay in epoch 0."""
@@ -58,11 +66,13 @@ class EpochSampler(Sampler[tuple[int, int]]):
         if self.shuffle:
             # The stream of an index no shape has.
             order = generator(Key(self.seed, STREAM["train"], self.epoch, 2**40)).permutation(order)
-        left, self.done = order[self.done :], 0
+        own = order[self.rank :: self.world][: len(self)]
+        left, self.done = own[self.done :], 0
         return ((self.epoch, int(shape)) for shape in left)
 
     def __len__(self) -> int:
-        return self.size
+        left_over = self.size % self.world if not self.shuffle else 0
+        return self.size // self.world + (self.rank < left_over)
 
 
 class RegistrationDataModule(L.LightningDataModule):
@@ -157,28 +167,37 @@ class RegistrationDataModule(L.LightningDataModule):
 
     def train_dataloader(self) -> DataLoader[PairBatch]:
         """Fresh pairs of every training shape in a new order each epoch."""
-        return self._loader("train", self.how)
+        return self._loader("train", self.how, self._share())
 
     def val_dataloader(self) -> DataLoader[PairBatch]:
         """One frozen pair of each held-out training shape."""
-        return self._loader("val", replace(self.how, stretch=1.0))
+        return self._loader("val", replace(self.how, stretch=1.0), self._share())
 
     def test_dataloader(self, **changes: float) -> DataLoader[PairBatch]:
-        """One frozen pair of each test shape; `changes` replace fields of PairSettings."""
+        """One frozen pair of each test shape; `changes` replace fields of PairSettings.
+
+        All of them, however many processes train.
+        """
         return self._loader("test", replace(self.how, stretch=1.0, **changes))
 
-    def _loader(self, split: Split, how: PairSettings) -> DataLoader[PairBatch]:
+    def _share(self) -> tuple[int, int]:
+        """Which of how many processes this is."""
+        return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
+
+    def _loader(
+        self, split: Split, how: PairSettings, share: tuple[int, int] = (0, 1)
+    ) -> DataLoader[PairBatch]:
         dataset = PairDataset(self.clouds(split), how, self.seed, split)
         training = split == "train"
+        goes_on = self.goes_on if training else {}
+        sampler = EpochSampler(len(dataset), self.seed, training, **goes_on, share=share)
         return DataLoader(
             dataset,
             batch_size=self.batch_size,
-            sampler=EpochSampler(
-                len(dataset), self.seed, training, **(self.goes_on if training else {})
-            ),
+            sampler=sampler,
             num_workers=self.num_workers,
             collate_fn=_as_is,  # pyright: ignore[reportArgumentType] (__getitems__ makes the batch)
-            drop_last=training and len(dataset) >= self.batch_size,
+            drop_last=training and len(sampler) >= self.batch_size,
             persistent_workers=self.num_workers > 0,
             pin_memory=torch.cuda.is_available(),
         )

@@ -1,0 +1,202 @@
+"""What a run promises when something goes wrong; docs/reliability.md lists these tests."""
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+
+import pytest
+import torch
+from conftest import ROOT
+from test_experiment import load, press_ctrl_c, train
+
+from corrmat import experiment
+from corrmat.cli import main
+from corrmat.errors import CorrmatError
+
+STEPS = ("--trainer.max_steps", "20")
+
+
+def command(*words):
+    options = ("--scale", "smoke", "--trainer.enable_progress_bar", "false", "--logger", "none")
+    return [sys.executable, "-m", "corrmat", *words, *options]
+
+
+def start(folder, *words):
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(
+        command(*words), cwd=folder, env=environment,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    )  # fmt: skip
+
+
+def weights(folder, name="last.ckpt"):
+    return torch.load(folder / name, weights_only=True)["state_dict"]
+
+
+def assert_same_end(folder, trained, whole):
+    """Weights, curve and count of an arm are those of a run that nothing had happened to."""
+    assert trained.pairs_seen == whole.pairs_seen
+    assert trained.curve == whole.curve
+    ours, theirs = weights(folder), weights(whole.checkpoint.parent)
+    assert all(torch.equal(ours[key], theirs[key]) for key in theirs)
+
+
+def interrupted(folder, settings, step=5):
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit):  # noqa: PT012
+        press_ctrl_c("training_step", step, patch)
+        train("DCP_corr", settings, folder)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # Lightning leaves it ignored
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """An arm that nothing has happened to."""
+    torch.set_num_threads(1)
+    folder = tmp_path_factory.mktemp("whole")
+    return train("DCP_corr", load("1.1", *STEPS).settings["DCP_corr"], folder)
+
+
+def killed(folder, after):
+    """Kill -9 a training that has just validated for the `after`th time."""
+    config = str(ROOT / "configs/exp/1.1.yaml")
+    process = start(folder, "fit", "--config", config, "--arm", "DCP_corr", *STEPS)
+    validations = (line for line in process.stdout if line.startswith("step"))
+    for _ in range(after):
+        next(validations)
+    process.kill()
+    process.communicate()
+
+
+def test_kill_9_and_the_same_command_end_as_if_nothing_had_been(tmp_path, whole, capsys):
+    torch.set_num_threads(1)
+    killed(tmp_path, after=3)
+    folder = tmp_path / "runs/smoke/shapes/1.1/DCP_corr"
+    assert not (folder / "trained.json").exists()
+    trained = train("DCP_corr", load("1.1", *STEPS).settings["DCP_corr"], folder)
+    assert "going on from" in capsys.readouterr().out
+    assert_same_end(folder, trained, whole)
+
+
+@pytest.mark.slow
+def test_kill_9_at_any_moment(tmp_path, whole):
+    """Killed again and again, a little later every time, until there is nothing left to do."""
+    torch.set_num_threads(1)
+    folder, config = tmp_path / "runs/smoke/shapes/1.1/DCP_corr", ROOT / "configs/exp/1.1.yaml"
+    for kills in range(40):
+        process = start(tmp_path, "fit", "--config", str(config), "--arm", "DCP_corr", *STEPS)
+        try:
+            process.communicate(timeout=4 + kills / 4)
+            break
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.communicate()
+    assert process.returncode == 0
+    assert kills > 3
+    done = json.loads((folder / "trained.json").read_text())
+    assert (done["pairs_seen"], done["curve"]) == (whole.pairs_seen, whole.curve)
+    ours, theirs = weights(folder), weights(whole.checkpoint.parent)
+    assert all(torch.equal(ours[key], theirs[key]) for key in theirs)
+
+
+def test_sigterm_saves_and_says_how_to_go_on(tmp_path):
+    config = str(ROOT / "configs/exp/1.1.yaml")
+    process = start(tmp_path, "fit", "--config", config, "--arm", "DCP_corr",
+                    "--trainer.max_steps", "100000")  # fmt: skip
+    next(line for line in process.stdout if line.startswith("step"))
+    process.terminate()
+    said, _ = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert (tmp_path / "runs/smoke/shapes/1.1/DCP_corr/last.ckpt").exists()
+    assert "the same command goes on from there" in said
+    assert "Traceback" not in said
+
+
+def test_fresh_starts_anew(tmp_path, whole, capsys):
+    torch.set_num_threads(1)
+    settings = load("1.1", *STEPS).settings["DCP_corr"]
+    interrupted(tmp_path / "arm", settings)
+    trained = train("DCP_corr", settings, tmp_path / "arm", fresh=True)
+    assert "going on from" not in capsys.readouterr().out
+    assert_same_end(tmp_path / "arm", trained, whole)
+
+
+def test_a_checkpoint_cut_short_is_left_out(tmp_path, whole, capsys):
+    torch.set_num_threads(1)
+    settings = load("1.1", *STEPS).settings["DCP_corr"]
+    interrupted(tmp_path / "arm", settings)
+    last = tmp_path / "arm" / "last.ckpt"
+    last.write_bytes(last.read_bytes()[:-1000])
+    trained = train("DCP_corr", settings, tmp_path / "arm")
+    said = capsys.readouterr().out
+    assert "last.ckpt cannot be read" in said
+    assert "going on from" in said
+    assert_same_end(tmp_path / "arm", trained, whole)
+
+
+def test_a_full_disk_keeps_the_last_good_checkpoint(tmp_path, whole):
+    """A limit on the size of files is what a full disk is: writing fails half way."""
+    torch.set_num_threads(1)
+    settings, folder = load("1.1", *STEPS).settings["DCP_corr"], tmp_path / "arm"
+    interrupted(folder, settings)
+    before = {path.name: path.read_bytes() for path in folder.glob("*.ckpt")}
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before["last.ckpt"]) // 2, hard))
+    try:
+        with pytest.raises(CorrmatError, match=r"File too large.*last good checkpoint: .*last"):
+            train("DCP_corr", settings, folder, logger="none")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert {path.name: path.read_bytes() for path in folder.glob("*.ckpt")} == before
+    assert not list(folder.glob("*.partial"))
+    assert_same_end(folder, train("DCP_corr", settings, folder), whole)
+
+
+@pytest.mark.parametrize("option", ["--results", "--runs"])
+def test_a_folder_that_cannot_be_written_is_said_at_once(option, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("not a folder")
+    monkeypatch.setattr(experiment, "train", None)
+    config = str(ROOT / "configs/exp/1.1.yaml")
+    code = main(["run", "--config", config, "--scale", "smoke", option, str(tmp_path / "file/x")])
+    assert code == 2
+    assert "cannot write to" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_reader_that_leaves_early_gets_no_traceback():
+    process = subprocess.Popen(
+        command("run", "--help"), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    process.stdout.close()
+    assert process.stderr.read() == ""
+    assert process.wait() == 0
+
+
+def test_two_processes_train_as_one_does(tmp_path):
+    """DDP: the same curve at the same global batch, every validation pair counted once.
+
+    RPMNet, for its norms know no batch; three held-out pairs, which two cannot share evenly.
+    """
+    config = str(ROOT / "configs/exp/2.2.yaml")
+    common = ("--data.train_shapes", "30", "--trainer.max_steps", "8")
+    process = start(
+        tmp_path, "run", "--config", config, *common, "--data.batch_size", "2",
+        "--trainer.accelerator", "cpu", "--trainer.devices", "2", "--trainer.strategy", "ddp",
+    )  # fmt: skip
+    said, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, said
+    found = load("2.2", *common, "--data.batch_size", "4", "--trainer.accelerator", "cpu")
+    torch.set_num_threads(1)
+    alone = experiment.run(found, tmp_path / "results_1", tmp_path / "runs_1", "none")
+    record = json.loads((tmp_path / "results/smoke/shapes/2.2/metrics.json").read_text())
+    for arm in found.settings:
+        ours, theirs = record["arms"][arm], alone["arms"][arm]
+        assert ours["pairs_seen"] == theirs["pairs_seen"] == 32
+        assert len(ours["curve"]) == len(theirs["curve"]) == 2
+        for one, other in zip(ours["curve"], theirs["curve"], strict=True):
+            for name in ("loss", "rotation_error_deg_mean", "match_accuracy", "chamfer"):
+                assert one[name] == pytest.approx(other[name], rel=1e-3, abs=1e-5)
+        assert ours["pairs"] == theirs["pairs"] == 8
