@@ -3,6 +3,7 @@ SCALE ?= laptop
 DATA  ?= shapes
 ROOT  ?=
 ARGS  ?=
+LAUNCHER ?=
 PYTHON ?= python3
 UV_VERSION := 0.13.9
 
@@ -12,7 +13,7 @@ BIN := .venv/bin
 EXPERIMENTS := exp1.1 exp1.2 exp1.3 exp1.4 exp2.1 exp2.2 exp2.3 exp2.4 exp3.1 exp3.2 exp3.3
 RUN_OPTIONS = --scale $(SCALE) --data.data $(DATA) $(if $(ROOT),--data.root "$(ROOT)") $(ARGS)
 
-.PHONY: help $(EXPERIMENTS) outliers robustness all weights protocols docs report bench lint format test test-slow lock clean
+.PHONY: help $(EXPERIMENTS) outliers robustness all on-ray weights protocols docs report bench lint format test test-slow lock clean
 
 help:  ## list the targets
 	@echo "make TARGET [SCALE=smoke|laptop|paper] [DATA=shapes|modelnet40] [ROOT=folder] [ARGS='--key value']"
@@ -27,7 +28,10 @@ outliers: .venv/ready  ## DCP with outliers, three ways to their class (suppleme
 robustness: .venv/ready  ## figure 2: wrong matches against a wrong rotation vector, in seconds
 	$(BIN)/python reproduce/robustness.py --scale $(SCALE)
 
-all: robustness $(EXPERIMENTS) outliers  ## every experiment, figure 2 first
+all: $(if $(filter ray,$(LAUNCHER)),on-ray) robustness $(EXPERIMENTS) outliers  ## every experiment, figure 2 first; LAUNCHER=ray trains on a cluster
+
+on-ray: .venv/ready
+	$(BIN)/python reproduce/on_ray.py $(RUN_OPTIONS)
 
 weights: .venv/ready  ## train what `corrmat register` ships on the embedded shapes, put it into the package
 	$(BIN)/python reproduce/weights.py --scale $(SCALE) $(ARGS)

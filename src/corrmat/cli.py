@@ -98,7 +98,7 @@ def reproduce(experiment: str) -> None:
 
 
 def _command(words: list[str]) -> int:
-    known, options = _parser().parse_known_args(words)
+    known, options = parser().parse_known_args(words)
     plain = {
         "register": lambda: _register(known),
         "example": lambda: _example(known.folder),
@@ -113,15 +113,16 @@ def _command(words: list[str]) -> int:
     return plain[known.command]()
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+def parser() -> argparse.ArgumentParser:
+    """The command line, but for the settings of recipes, which are left over."""
+    found = argparse.ArgumentParser(
         "corrmat",
         description="Correspondence Matrices are Underrated (3DV 2020), reproduced.",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     raw = argparse.RawDescriptionHelpFormatter
-    commands = parser.add_subparsers(dest="command", metavar="command", required=True)
+    commands = found.add_subparsers(dest="command", metavar="command", required=True)
     for name, (purpose, examples) in EXPERIMENT_COMMANDS.items():
         command = commands.add_parser(
             name, help=purpose, description=purpose, add_help=False, allow_abbrev=False,
@@ -163,7 +164,7 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument("--docs", type=Path, help="folder of README.md and docs/: rewrite tables")
     completion = commands.add_parser("completion", help="print what makes a shell complete words")
     completion.add_argument("shell", choices=["bash", "zsh", "tcsh"])
-    return parser
+    return found
 
 
 def _experiment_options(command: argparse.ArgumentParser, name: str) -> None:
@@ -380,14 +381,14 @@ def _completion(shell: str) -> int:
 
     from corrmat import recipe
 
-    parser = _parser()
-    commands = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
+    own = parser()
+    commands = next(a for a in own._actions if isinstance(a, argparse._SubParsersAction))
     typed = [name for a in recipe.parser("DCP_corr")._actions for name in a.option_strings]
     for command in ("run", "fit", "evaluate"):
         for name in typed:
             if "." in name or name == "--seed":
                 commands.choices[command].add_argument(name, metavar="VALUE")
-    print(shtab.complete(parser, shell))
+    print(shtab.complete(own, shell))
     return 0
 
 
