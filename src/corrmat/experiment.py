@@ -133,7 +133,11 @@ def run(
         "data": recipe.data,
         "seed": ready[0].settings.seed,
         "commit": record.commit(),
-        "hardware": {"threads": torch.get_num_threads(), "gpu": torch.cuda.is_available()},
+        "hardware": {
+            "threads": torch.get_num_threads(),
+            "gpu": torch.cuda.is_available(),
+            "precision": _precision(ready[0].settings),
+        },
         "versions": {name: version(name) for name in ("corrmat", "torch", "lightning", "numpy")},
         "bands_deg": list(recipe.bands_deg),
         "arms": scores,
@@ -200,7 +204,7 @@ def train(
     config = report.plain(settings.as_dict())
     made = logs.loggers(logger, folder, arm.name, group, config)
     options = trainer_options(settings)
-    options["precision"] = options["precision"] or default_precision(options["accelerator"])
+    options["precision"] = _precision(settings)
     keep_freed_memory()
     trainer = L.Trainer(**options, logger=made, callbacks=callbacks, default_root_dir=folder)
     datamodule.trainer = trainer
@@ -392,6 +396,11 @@ def trainer_options(settings: Settings) -> dict[str, Any]:
     if options["accelerator"] == "auto" and torch.backends.mps.is_available():
         options["accelerator"] = "cpu"  # Apple's GPUs lack the float64 that Procrustes needs
     return options
+
+
+def _precision(settings: Settings) -> str:
+    options = trainer_options(settings)
+    return str(options["precision"] or default_precision(options["accelerator"]))
 
 
 def default_precision(accelerator: str) -> str:

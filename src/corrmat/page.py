@@ -29,10 +29,16 @@ FAMILY_CODE = {
     "DCP": (
         "networks/dcp.py",
         "networks/dgcnn.py",
+        "networks/edges.py",
         "networks/attention.py",
         "networks/outliers.py",
     ),
-    "RPMNet": ("networks/rpmnet.py", "networks/ppf.py", "networks/pointnet.py"),
+    "RPMNet": (
+        "networks/rpmnet.py",
+        "networks/edges.py",
+        "networks/ppf.py",
+        "networks/pointnet.py",
+    ),
     "PCRNet": ("networks/pcrnet.py", "networks/pointnet.py", "networks/outliers.py"),
 }
 QUANTILES = np.linspace(0, 1, 201)
@@ -167,6 +173,7 @@ def _provenance(record: Mapping[str, Any], source: str) -> str:
     )
     machine = record.get("hardware", {})
     where = f"{machine.get('threads', '?')} CPU threads" + (", a GPU" if machine.get("gpu") else "")
+    where += f", {machine['precision']}" if "precision" in machine else ""
     where += "".join(f", {name} {version}" for name, version in record.get("versions", {}).items())
     facts = (
         f"commit {record.get('commit')}, seed {record['seed']}, {where}. {effort}. File: {source}"
