@@ -102,7 +102,7 @@ def _start(folder: Path, job: str, group: str, config: Mapping[str, Any]) -> Any
         name=f"{group}/{job}",
         group=group,
         job_type=job,
-        dir=folder,
+        dir=str(folder),
         mode="online" if _mode() == "online" else "offline",
         config=dict(config),
         settings=wandb.Settings(
