@@ -26,8 +26,8 @@ def train(configs: Sequence[Path], words: Sequence[str]) -> None:
         CorrmatError: Ray is missing, or an arm fails.
     """
     try:
-        import ray
-        from ray.exceptions import RayError
+        import ray  # pyright: ignore[reportMissingImports] (an extra)
+        from ray.exceptions import RayError  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise CorrmatError("LAUNCHER=ray needs Ray: pip install 'corrmat[ray]'") from error
     known, options = parser().parse_known_args(["fit", *words])
