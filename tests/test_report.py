@@ -69,6 +69,7 @@ def test_the_figure_is_drawn_the_same_twice(tmp_path):
         ("docs/reproduction.md", "tables", lambda records, _: report.markdown_tables(records)),
         ("README.md", "register", lambda _, results: report.markdown_register(results)),
         ("docs/register.md", "networks", lambda _, results: report.markdown_networks(results)),
+        ("docs/register.md", "confidence", lambda _, results: report.markdown_confidence(results)),
     ],
 )
 def test_the_documents_say_what_the_records_say(page, name, make):

@@ -169,6 +169,30 @@ def markdown_networks(results: Path) -> str:
     return "\n".join(lines)
 
 
+def markdown_confidence(results: Path) -> str:
+    """The table of docs/register.md: what the confidence promised, and how often it was so."""
+    from corrmat import comparison, registration
+
+    lines = [_row(["data", "confidence", "pairs", "promised", "aligned"]), "|---|---|---|---|---|"]
+    for data in ("shapes", "modelnet40"):
+        promised: list[float] = []
+        aligned: list[bool] = []
+        for path in sorted((results / "register").glob(f"*-{data}-*.json")):
+            found = json.loads(path.read_text())["models"]["corrmat"]["per_pair"]
+            both = zip(found["agreement"], found["support"], strict=True)
+            promised += [registration.calibrated(*values) for values in both]
+            aligned += [near < comparison.NEAR for near in found["adds"]]
+        for low, high in itertools.pairwise((0, 0.25, 0.5, 0.75, 1)):
+            here = [i for i, value in enumerate(promised) if low <= value < high]
+            if here:
+                shares = [
+                    sum(values[i] for i in here) / len(here) for values in (promised, aligned)
+                ]
+                cells = [f"{low:.0%} to {high:.0%}", str(len(here)), *(f"{s:.0%}" for s in shares)]
+                lines.append(_row([data, *cells]))
+    return "\n".join(lines)
+
+
 def read_records(results: Path, scale: str = "*") -> list[dict[str, Any]]:
     """Every record below a folder, ordered by scale, experiment and data."""
     found = results.glob(f"{scale}/*/*/metrics.json")
