@@ -129,6 +129,12 @@ def _wide(rows: Tensor) -> Tensor:
     return rows if rows.dtype == torch.float64 else rows.float()
 
 
+def _slabs(batch: int, points: int, size: int) -> list[tuple[int, slice]]:
+    """Sample by sample, `size` points at a time."""
+    starts = range(0, points, size)
+    return [(b, slice(at, min(at + size, points))) for b in range(batch) for at in starts]
+
+
 class _LinearReluMax(torch.autograd.Function):
     @staticmethod
     def forward(ctx, rows: Tensor, weight: Tensor, bias: Tensor, keep: bool, gather: bool):  # noqa: ANN001, ANN205
@@ -144,22 +150,20 @@ class _LinearReluMax(torch.autograd.Function):
         scratch, marks = rows.new_empty(size, *shape), ranks.new_empty(size, *shape)
         total = _wide(bias).new_zeros(batch, shape[1]) if gather else None
         second = _wide(bias).new_zeros(batch, shape[1], shape[1]) if gather else None
-        for b in range(batch):
-            for at in range(0, points, size):
-                part = slice(at, min(at + size, points))
-                some = part.stop - part.start
-                active = scratch[:some] if out is None else out[b, part]
-                flat = active.view(-1, shape[1])
-                torch.addmm(bias[b], rows[b, part].flatten(0, 1), weight[b].mT, out=flat).relu_()
-                torch.amax(active, 1, out=top[b, part])
-                if which is not None:
-                    # As numbers: torch's maximum with indices takes several times as long.
-                    torch.eq(active, top[b, part].unsqueeze(1), out=marks[:some]).mul_(ranks)
-                    which[b, part] = marks[:some].amax(1).long()
-                if total is not None and second is not None:
-                    wide = _wide(flat)
-                    total[b] += wide.sum(0)
-                    second[b].addmm_(wide.mT, wide)
+        for b, part in _slabs(batch, points, size):
+            some = part.stop - part.start
+            active = scratch[:some] if out is None else out[b, part]
+            flat = active.view(-1, shape[1])
+            torch.addmm(bias[b], rows[b, part].flatten(0, 1), weight[b].mT, out=flat).relu_()
+            torch.amax(active, 1, out=top[b, part])
+            if which is not None:
+                # As numbers: torch's maximum with indices takes several times as long.
+                torch.eq(active, top[b, part].unsqueeze(1), out=marks[:some]).mul_(ranks)
+                which[b, part] = marks[:some].amax(1).long()
+            if total is not None and second is not None:
+                wide = _wide(flat)
+                total[b] += wide.sum(0)
+                second[b].addmm_(wide.mT, wide)
         ctx.save_for_backward(rows, weight, out, top, which)
         return out, top, total, second
 
@@ -181,23 +185,19 @@ class _LinearReluMax(torch.autograd.Function):
         grad_top = None if grad_top is None else grad_top * (top > 0)
         bend = None if grad_second is None else (grad_second + grad_second.mT).to(rows.dtype)
         scratch = rows.new_empty(size, k, outputs)
-        for b in range(batch):
-            for at in range(0, points, size):
-                part = slice(at, min(at + size, points))
-                grad = scratch[: part.stop - part.start]
-                flat = grad.view(-1, outputs)
-                grad.zero_() if grad_out is None else grad.copy_(grad_out[b, part])
-                if grad_top is not None:
-                    grad.scatter_add_(
-                        1, which[b, part].unsqueeze(1), grad_top[b, part].unsqueeze(1)
-                    )
-                if out is not None:
-                    active = out[b, part].flatten(0, 1)
-                    if bend is not None and grad_total is not None:
-                        flat.addmm_(active, bend[b]).add_(grad_total[b])
-                    torch.ops.aten.threshold_backward.grad_input(flat, active, 0, grad_input=flat)
-                grad_weight[b] += rows[b, part].flatten(0, 1).mT @ flat
-                grad_bias[b] += flat.sum(0)
-                if grad_rows is not None:
-                    torch.mm(flat, weight[b], out=grad_rows[b, part].flatten(0, 1))
+        for b, part in _slabs(batch, points, size):
+            grad = scratch[: part.stop - part.start]
+            flat = grad.view(-1, outputs)
+            grad.zero_() if grad_out is None else grad.copy_(grad_out[b, part])
+            if grad_top is not None:
+                grad.scatter_add_(1, which[b, part].unsqueeze(1), grad_top[b, part].unsqueeze(1))
+            if out is not None:
+                active = out[b, part].flatten(0, 1)
+                if bend is not None and grad_total is not None:
+                    flat.addmm_(active, bend[b]).add_(grad_total[b])
+                torch.ops.aten.threshold_backward.grad_input(flat, active, 0, grad_input=flat)
+            grad_weight[b] += rows[b, part].flatten(0, 1).mT @ flat
+            grad_bias[b] += flat.sum(0)
+            if grad_rows is not None:
+                torch.mm(flat, weight[b], out=grad_rows[b, part].flatten(0, 1))
         return grad_rows, grad_weight.mT.to(weight.dtype), grad_bias.to(weight.dtype), None, None
