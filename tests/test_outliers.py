@@ -5,8 +5,8 @@ from conftest import golden
 from corrmat import metrics
 from corrmat.data.datamodule import RegistrationDataModule
 from corrmat.losses import correspondence_loss
+from corrmat.networks.compare import COMPARE
 from corrmat.networks.dcp import DCPNetwork
-from corrmat.networks.outliers import COMPARE
 from corrmat.ops.correspondence import SoftCorrespondence, outlier_feature
 from corrmat.ops.rigid import procrustes
 from corrmat.types import Prediction

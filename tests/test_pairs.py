@@ -191,6 +191,20 @@ def test_a_pair_does_not_depend_on_its_batch():
             torch.testing.assert_close(a[0], b, rtol=1e-6, atol=1e-6)
 
 
+def test_the_checksum_is_of_the_pairs_and_of_nothing_else():
+    known = datamodule().checksum()
+    assert datamodule(num_workers=2).checksum() == known
+    one = datamodule()
+    one.batch_size = 1
+    assert one.checksum() == known
+    others = [datamodule(seed=1).checksum(), known, datamodule().checksum([{"rotation_deg": 9.0}])]
+    assert len(set(others)) == 3
+    # The last bits of a coordinate are the machine's own.
+    clouds = one.clouds("test")
+    clouds.rows[:] = np.nextafter(clouds.rows, np.float32(1))
+    assert one.checksum() == known
+
+
 def test_a_tenth_of_train_is_held_out_by_seed():
     splits = [datamodule(seed=seed) for seed in (0, 0, 1)]
     held = [{row.tobytes() for row in s.clouds("val").rows} for s in splits]

@@ -4,7 +4,7 @@ from conftest import ROOT
 
 from corrmat import recipe
 from corrmat.errors import CorrmatError
-from corrmat.experiment import make_module
+from corrmat.experiment import bands, make_datamodule, make_module
 from corrmat.methods import METHODS
 
 RECIPES = sorted((ROOT / "configs" / "exp").glob("*.yaml"))
@@ -28,6 +28,27 @@ def test_every_recipe_builds_at_every_scale(path, scale):
     for settings in found.settings.values():
         own = {k: v for k, v in settings.network.as_dict().items() if k != "outlier"}
         assert own.items() <= first.network.as_dict().items()
+
+
+@pytest.mark.parametrize(
+    "scale", ["smoke", *(pytest.param(s, marks=pytest.mark.slow) for s in ("laptop", "paper"))]
+)
+@pytest.mark.parametrize("path", RECIPES, ids=lambda p: p.stem)
+def test_the_frozen_test_pairs_are_the_recipes(path, scale):
+    found = recipe.load(path, scale, [])
+    for settings in found.settings.values():
+        made = make_datamodule(settings).checksum(bands(found.bands_deg))
+        assert made == found.test_pairs
+
+
+def test_a_checksum_is_only_for_the_pairs_that_it_was_made_of():
+    path = ROOT / "configs" / "exp" / "1.2.yaml"
+    known = recipe.load(path, "smoke", []).test_pairs
+    assert known
+    assert recipe.load(path, "smoke", ["--data.batch_size", "2"]).test_pairs == known
+    for options in (["--seed", "1"], ["--data.keep=0.5"], ["--data.test_shapes", "7"]):
+        assert recipe.load(path, "smoke", options).test_pairs is None
+    assert recipe.load(path, "smoke", ["--data.data", "modelnet40"]).test_pairs is None
 
 
 @pytest.mark.parametrize("path", RECIPES, ids=lambda p: p.stem)

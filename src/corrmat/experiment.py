@@ -101,6 +101,12 @@ def run(
     for folder in (results / place, runs / place):
         ensure_writable(folder)
     ready = [prepare(name, settings) for name, settings in recipe.settings.items()]
+    test_pairs = ready[0].datamodule.checksum(bands(recipe.bands_deg))
+    if recipe.test_pairs not in (None, test_pairs):
+        say(
+            f"the test pairs made here ({test_pairs}) are not the recipe's ({recipe.test_pairs}): "
+            "numbers compare with other records in the mean only"
+        )
     scores, rows, views = {}, [], []
     with Board() as board:
         for arm in ready:
@@ -139,6 +145,7 @@ def run(
             "precision": _precision(ready[0].settings),
         },
         "versions": {name: version(name) for name in ("corrmat", "torch", "lightning", "numpy")},
+        "test_pairs": test_pairs,
         "bands_deg": list(recipe.bands_deg),
         "arms": scores,
         "baselines": baselines,

@@ -31,7 +31,7 @@ FAMILY_CODE = {
         "networks/dgcnn.py",
         "networks/edges.py",
         "networks/attention.py",
-        "networks/outliers.py",
+        "networks/compare.py",
     ),
     "RPMNet": (
         "networks/rpmnet.py",
@@ -39,7 +39,7 @@ FAMILY_CODE = {
         "networks/ppf.py",
         "networks/pointnet.py",
     ),
-    "PCRNet": ("networks/pcrnet.py", "networks/pointnet.py", "networks/outliers.py"),
+    "PCRNet": ("networks/pcrnet.py", "networks/pointnet.py", "networks/compare.py"),
 }
 QUANTILES = np.linspace(0, 1, 201)
 Plots = dict[str, dict[str, Any]]

@@ -32,6 +32,7 @@ _TOP = {
     "sweep_outliers",
     "networks_of",
     "baselines",
+    "test_pairs",
     "base",
     "seed",
     *GROUPS,
@@ -48,6 +49,15 @@ _NOT_TRAINER: set[str | int] = {  # ours to decide
     "use_distributed_sampler",
 }
 
+_NOT_TEST_PAIRS = {  # options of the data that leave them alone
+    "--data.data",
+    "--data.root",
+    "--data.batch_size",
+    "--data.num_workers",
+    "--data.train_shapes",
+    "--data.stretch",
+}
+
 
 @dataclass(frozen=True)
 class Recipe:
@@ -62,6 +72,7 @@ class Recipe:
     sweep_outliers: tuple[float, ...]  # shares of outliers to test on besides; may be empty
     networks_of: str | None  # the experiment whose trained networks serve here too
     baselines: tuple[str, ...]  # what else is tested: names of `baselines`
+    test_pairs: str | None  # checksum that the frozen pairs must have; None: not known
 
     @property
     def data(self) -> str:
@@ -114,6 +125,7 @@ def load(path: Path, scale: str, options: list[str], arms: list[str] | None = No
         sweep_outliers=tuple(merged.get("sweep_outliers", ())),
         networks_of=merged.get("networks_of"),
         baselines=_known_baselines(merged.get("baselines", ()), path),
+        test_pairs=_checksum(merged, scale, settings, options),
     )
 
 
@@ -162,6 +174,17 @@ def _known_baselines(names: Sequence[str], path: Path) -> tuple[str, ...]:
         if name not in known:
             raise CorrmatError(f"{path}: unknown baseline {name!r}; known: {', '.join(known)}")
     return tuple(names)
+
+
+def _checksum(
+    merged: dict[str, Any], scale: str, settings: dict[str, Namespace], options: Sequence[str]
+) -> str | None:
+    """The recipe's checksum, unless an option asks for other test pairs or another data set."""
+    names = {option.split("=")[0] for option in options} - _NOT_TEST_PAIRS
+    other = any(name == "--seed" or name.startswith("--data.") for name in names)
+    if other or any(arm.data.data != "shapes" for arm in settings.values()):
+        return None
+    return merged.get("test_pairs", {}).get(scale)
 
 
 def _first_line(error: Exception) -> str:

@@ -1,6 +1,7 @@
 """Pairs for training, validation and test, made on the fly from either source of shapes."""
 
-from collections.abc import Iterator, Sequence
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -179,6 +180,25 @@ class RegistrationDataModule(L.LightningDataModule):
         All of them, however many processes train.
         """
         return self._loader("test", replace(self.how, stretch=1.0, **changes))
+
+    def checksum(self, changes: Sequence[Mapping[str, float]] = ({},)) -> str:
+        """What the frozen test pairs are, as text that is the same on every machine.
+
+        A CRC of all matches, and the mean absolute coordinate of sources and of targets to five
+        decimals: CPUs differ in the last bits of a coordinate.
+
+        Args:
+            changes: as for `test_dataloader`, one set of pairs each.
+        """
+        matches, total, count = 0, torch.zeros(2, dtype=torch.float64), torch.zeros(2)
+        for how in changes:
+            for batch in self.test_dataloader(**how):
+                matches = zlib.crc32(batch.match.numpy().astype("<i8").tobytes(), matches)
+                clouds = [cloud[..., :3].double() for cloud in (batch.source, batch.target)]
+                total += torch.stack([cloud.abs().sum() for cloud in clouds])
+                count += torch.tensor([cloud.numel() for cloud in clouds])
+        source, target = (total / count).tolist()
+        return f"{matches:08x} {source:.5f} {target:.5f}"
 
     def _share(self) -> tuple[int, int]:
         """Which of how many processes this is."""

@@ -5,8 +5,8 @@ from typing import Literal
 from torch import Tensor, nn
 
 from corrmat.networks.attention import Transformer
+from corrmat.networks.compare import COMPARE, Outlier
 from corrmat.networks.dgcnn import DGCNN
-from corrmat.networks.outliers import COMPARE, Outlier
 from corrmat.ops.rigid import procrustes
 from corrmat.types import Prediction
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from corrmat.networks.attention import Attention, FeedForward
-from corrmat.networks.outliers import Matchability
+from corrmat.networks.compare import Matchability
 from corrmat.networks.ppf import SIGNLESS, signless_pair_features
 from corrmat.ops.neighbors import take
 from corrmat.ops.rigid import procrustes

@@ -4,7 +4,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from corrmat.networks.outliers import Compare
+from corrmat.networks.compare import Compare
 from corrmat.networks.pointnet import PointNet
 from corrmat.ops import rigid
 from corrmat.ops.rigid import procrustes

@@ -1,6 +1,7 @@
 """Which points are near: k nearest, within a radius, the nearest of another cloud."""
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 _EXACT = "donot_use_mm_for_euclid_dist"
@@ -66,5 +67,6 @@ def nearest(points: Tensor, cloud: Tensor) -> Tensor:
 
 def take(values: Tensor, index: Tensor) -> Tensor:
     """Rows of values (B, M, C) at index (B, ...): (B, ..., C)."""
-    flat = index.flatten(1).unsqueeze(-1).expand(-1, -1, values.shape[-1])
-    return values.gather(1, flat).unflatten(1, index.shape[1:])
+    first = torch.arange(0, values.shape[0] * values.shape[1], values.shape[1], device=index.device)
+    # As an embedding: on CPUs several times faster than `gather`, forward and backward.
+    return F.embedding(index + first.view(-1, *[1] * (index.ndim - 1)), values.flatten(0, 1))

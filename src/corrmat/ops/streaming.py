@@ -9,7 +9,7 @@ batch has its own.
 import torch
 from torch import Tensor
 
-_DENSE = 2**22  # entries of a matrix that is made whole
+_DENSE = 2**23  # entries of a matrix that is made whole
 _SLICE = 2**21  # entries of a larger one that exist at once
 
 
