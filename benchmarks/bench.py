@@ -8,6 +8,7 @@ turn by turn, so that it holds on a noisy machine. The twins are in tests/twins.
 in the released formulation (NCHW edges, whole matrices, an SVD a pair, target features anew).
 """
 
+import contextlib
 import json
 import multiprocessing
 import resource
@@ -78,9 +79,12 @@ def main() -> None:
         row = in_a_process(training_step, method, hparams, n, batch)
         row["peak_share"] = round(row.pop("gflop_a_pair") / row["ms_a_pair"] * 1e3 / peak, 2)
         if method in ("DCP_corr", "RPMNet_corr"):
-            few = min(batch, 4)
-            row |= in_a_process(against_released, method, hparams, n, few)
+            row |= in_a_process(against_released, method, hparams, n, batch)
         add(f"step of {method}, {size}, N={n}, batch {batch}", row)
+    for method, hparams, n, batch in STEPS:
+        if n * batch <= 4096:
+            row = in_a_process(against_compiled, method, hparams, n, batch)
+            add(f"step of {method}, N={n}, batch {batch}, by torch.compile", row)
     for method in ("DCP_corr", "RPMNet_corr", "PCRNet_corr"):
         add(f"one pair through {method}, N=1024", in_a_process(inference, method))
     add("one pair through FPFH + RANSAC, N=1024", in_a_process(classical, "ransac"))
@@ -124,7 +128,7 @@ def pairs_a_second() -> Row:
 def training_step(method: str, hparams: dict[str, Any], n: int, batch: int) -> Row:
     """Milliseconds and billions of operations a pair of a training step, and its peak memory."""
     pairs, module, step = build(method, hparams, n, batch)
-    held = peak_mb()
+    held = held_mb()
     seconds = median([lambda: step(ours(module, pairs))], 3 if n * batch > 2000 else 20)[0]
     used = peak_mb() - held
     with FlopCounterMode(display=False) as counter:
@@ -139,7 +143,7 @@ def training_step(method: str, hparams: dict[str, Any], n: int, batch: int) -> R
 def against_released(method: str, hparams: dict[str, Any], n: int, batch: int) -> Row:
     """How many times longer a step in the released formulation takes, and its peak memory."""
     pairs, module, step = build(method, hparams, n, batch)
-    held = peak_mb()
+    held = held_mb()
 
     def released() -> torch.Tensor:
         if method == "DCP_corr":
@@ -151,6 +155,25 @@ def against_released(method: str, hparams: dict[str, Any], n: int, batch: int) -
     both = [lambda: step(ours(module, pairs)), lambda: step(released())]
     own, other = median(both, 1 if n * batch > 2000 else 9)
     return {"released_ratio": round(other / own, 2), "released_peak_mb": round(peak_mb() - held)}
+
+
+def against_compiled(method: str, hparams: dict[str, Any], n: int, batch: int) -> Row:
+    """What torch.compile makes of a step, and how many times longer the step takes without."""
+    pairs, module, step = build(method, hparams, n, batch)
+    start = time.perf_counter()
+    network = torch.compile(module.network)
+
+    def compiled() -> torch.Tensor:
+        return module.loss(network(pairs.source, pairs.target), pairs)
+
+    try:
+        step(compiled())
+    except Exception as error:  # noqa: BLE001 (the compiler's many)
+        return {"cannot": type(error).__name__}
+    seconds = time.perf_counter() - start
+    both = [lambda: step(compiled()), lambda: step(ours(module, pairs))]
+    own, plain = median(both, 20)
+    return {"seconds_to_compile": round(seconds), "plain_ratio": round(plain / own, 2)}
 
 
 @torch.no_grad()
@@ -269,7 +292,7 @@ def grown(what: str, n: int) -> Row:
         def run() -> None:
             step(ours(module, pairs))
 
-    held = peak_mb()
+    held = held_mb()
     seconds = median([run], 1 if n > 2048 else 3, warm=n <= 8192)[0]
     return {"seconds": round(seconds, 4), "peak_mb": round(peak_mb() - held)}
 
@@ -355,8 +378,19 @@ def in_a_process(work: Callable[..., Row], *arguments: Any) -> Row:  # noqa: ANN
         return pool.submit(work, *arguments).result()
 
 
+def held_mb() -> float:
+    """Resident size of this process, in megabytes, from where on `peak_mb` counts."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")  # Linux: the peak so far is what is held now
+    return peak_mb()
+
+
 def peak_mb() -> float:
-    """Largest resident size of this process so far, in megabytes."""
+    """Largest resident size of this process, in megabytes."""
+    status = Path("/proc/self/status")
+    if status.is_file():  # Linux's ru_maxrss begins with the parent's, even in a fresh process
+        line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
+        return int(line.split()[1]) / 2**10
     size = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return size / 2**20 if sys.platform == "darwin" else size / 2**10
 

@@ -36,6 +36,14 @@ def test_nearest_is_exact(chunk, generator, monkeypatch):
     assert knn(y, 1).squeeze(-1).tolist() == [list(range(11))] * 2
 
 
+@pytest.mark.parametrize("chunk", [1, 100, 2**24])
+def test_knn_is_exact_slice_by_slice(chunk, generator, monkeypatch):
+    monkeypatch.setattr(neighbors, "_CHUNK", chunk)
+    points = torch.randn(2, 40, 3, generator=generator)
+    order = (points.unsqueeze(2) - points.unsqueeze(1)).norm(dim=-1).argsort(-1)
+    assert torch.equal(knn(points, 7), order[..., :7])
+
+
 def test_pair_features_are_angles_and_a_distance():
     up, right = torch.tensor([0.0, 0, 1]), torch.tensor([1.0, 0, 0])
     found = point_pair_features(2 * right, up, right)

@@ -24,8 +24,8 @@ def command(*words):
     return [sys.executable, "-m", "corrmat", *words, *options]
 
 
-def start(folder, *words):
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+def start(folder, *words, **variables):
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", **variables}
     return subprocess.Popen(
         command(*words), cwd=folder, env=environment,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
@@ -175,19 +175,35 @@ def test_a_reader_that_leaves_early_gets_no_traceback():
     assert process.wait() == 0
 
 
-def test_two_processes_train_as_one_does(tmp_path):
+def slurm(task):
+    """What srun tells the second of two nodes, or the first, with a task each."""
+    return {
+        "SLURM_JOB_ID": str(os.getpid()), "SLURM_JOB_NAME": "corrmat", "SLURM_NTASKS": "2",
+        "SLURM_NTASKS_PER_NODE": "1", "SLURM_NNODES": "2", "SLURM_NODELIST": "localhost",
+        "SLURM_PROCID": task, "SLURM_NODEID": task, "SLURM_LOCALID": "0",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("launcher", ["lightning", pytest.param("slurm", marks=pytest.mark.slow)])
+def test_two_processes_train_as_one_does(tmp_path, launcher):
     """DDP: the same curve at the same global batch, every validation pair counted once.
 
     RPMNet, for its norms know no batch; three held-out pairs, which two cannot share evenly.
     """
     config = str(ROOT / "configs/exp/2.2.yaml")
     common = ("--data.train_shapes", "30", "--trainer.max_steps", "8")
-    process = start(
-        tmp_path, "run", "--config", config, *common, "--data.batch_size", "2",
-        "--trainer.accelerator", "cpu", "--trainer.devices", "2", "--trainer.strategy", "ddp",
+    words = (
+        "run", "--config", config, *common, "--data.batch_size", "2",
+        "--trainer.accelerator", "cpu", "--trainer.strategy", "ddp",
     )  # fmt: skip
-    said, _ = process.communicate(timeout=300)
-    assert process.returncode == 0, said
+    if launcher == "slurm":
+        words += ("--trainer.devices", "1", "--trainer.num_nodes", "2")
+        processes = [start(tmp_path, *words, **slurm(task)) for task in ("0", "1")]
+    else:
+        processes = [start(tmp_path, *words, "--trainer.devices", "2")]
+    for process in processes:
+        said, _ = process.communicate(timeout=300)
+        assert process.returncode == 0, said
     found = load("2.2", *common, "--data.batch_size", "4", "--trainer.accelerator", "cpu")
     torch.set_num_threads(1)
     alone = experiment.run(found, tmp_path / "results_1", tmp_path / "runs_1", "none")

@@ -70,6 +70,7 @@ def test_the_figure_is_drawn_the_same_twice(tmp_path):
         ("README.md", "register", lambda _, results: report.markdown_register(results)),
         ("docs/register.md", "networks", lambda _, results: report.markdown_networks(results)),
         ("docs/register.md", "confidence", lambda _, results: report.markdown_confidence(results)),
+        ("docs/speed.md", "bench", lambda _, results: report.markdown_bench(results)),
     ],
 )
 def test_the_documents_say_what_the_records_say(page, name, make):

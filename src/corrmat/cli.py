@@ -427,6 +427,7 @@ def _report(results: Path, output: Path | None, docs: Path | None) -> int:
         report.refresh(docs / "docs" / "register.md", "networks", networks)
         confidence = report.markdown_confidence(results)
         report.refresh(docs / "docs" / "register.md", "confidence", confidence)
+        report.refresh(docs / "docs" / "speed.md", "bench", report.markdown_bench(results))
         report.refresh(pages[1], "tables", report.markdown_tables(records))
         print(f"{len(records)} records -> {pages[0]}, {pages[1]}")
     return 0

@@ -406,8 +406,7 @@ def trainer_options(settings: Settings) -> dict[str, Any]:
 
 
 def _precision(settings: Settings) -> str:
-    options = trainer_options(settings)
-    return str(options["precision"] or default_precision(options["accelerator"]))
+    return str(settings.trainer.precision or default_precision(settings.trainer.accelerator))
 
 
 def default_precision(accelerator: str) -> str:

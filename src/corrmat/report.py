@@ -193,6 +193,46 @@ def markdown_confidence(results: Path) -> str:
     return "\n".join(lines)
 
 
+def markdown_bench(results: Path) -> str:
+    """The table of docs/speed.md: every row of the last `make bench`."""
+    path = results / "bench" / "bench.json"
+    if not path.is_file():
+        return "No benchmark is recorded."
+    found = json.loads(path.read_text())
+    others = {
+        "released_ratio": "released",
+        "naive_ratio": "naive",
+        "dense_ratio": "dense",
+        "plain_ratio": "not compiled",
+    }
+    heads = ["what", "ms", "peak memory, MB", "share of the matrix product's GFLOP/s"]
+    lines = [_row([*heads, "the other way takes"]), "|---" * 5 + "|"]
+    for row in found["rows"]:
+        seconds = row["seconds"] * 1e3 if "seconds" in row else None
+        time = next((row[name] for name in ("ms_a_pair", "ms") if name in row), seconds)
+        cells = [
+            row["what"] + (" (a pair)" if "ms_a_pair" in row else ""),
+            f"{row['gflops']} GFLOP/s"
+            if time is None
+            else f"{time:.3g}"
+            if time < 100
+            else f"{time:,.0f}",
+            str(row.get("peak_mb", "")),
+            f"{row['peak_share']:.0%}" if "peak_share" in row else "",
+        ]
+        ratios = [f"{row[key]} x ({name})" for key, name in others.items() if key in row]
+        if "released_peak_mb" in row:
+            ratios.append(f"{row['released_peak_mb']} MB")
+        lines.append(_row([*cells, ", ".join(ratios) or row.get("cannot", "")]))
+    lines += [""] + [
+        f"- {what}, one pair of N points: time grows with N^{by['seconds']}, "
+        f"memory with N^{by['peak_mb']} (fitted from N = 1024 on)."
+        for what, by in found["exponents"].items()
+    ]
+    about = f"{found['threads']} threads, torch {found['torch']}"
+    return "\n".join([f"Measured with {about}.", "", *lines])
+
+
 def read_records(results: Path, scale: str = "*") -> list[dict[str, Any]]:
     """Every record below a folder, ordered by scale, experiment and data."""
     found = results.glob(f"{scale}/*/*/metrics.json")

@@ -145,7 +145,7 @@ class _LinearReluMax(torch.autograd.Function):
         out = rows.new_empty(batch, points, *shape) if keep else None
         top = rows.new_empty(batch, points, shape[1])
         learning = any(ctx.needs_input_grad)
-        which = torch.empty_like(top, dtype=torch.int64) if learning else None
+        which = torch.empty_like(top, dtype=torch.int16) if learning else None
         ranks = torch.arange(k, dtype=torch.float32, device=rows.device).unsqueeze(-1)
         scratch, marks = rows.new_empty(size, *shape), ranks.new_empty(size, *shape)
         total = _wide(bias).new_zeros(batch, shape[1]) if gather else None
@@ -159,7 +159,7 @@ class _LinearReluMax(torch.autograd.Function):
             if which is not None:
                 # As numbers: torch's maximum with indices takes several times as long.
                 torch.eq(active, top[b, part].unsqueeze(1), out=marks[:some]).mul_(ranks)
-                which[b, part] = marks[:some].amax(1).long()
+                which[b, part] = marks[:some].amax(1).to(which.dtype)
             if total is not None and second is not None:
                 wide = _wide(flat)
                 total[b] += wide.sum(0)
@@ -190,7 +190,8 @@ class _LinearReluMax(torch.autograd.Function):
             flat = grad.view(-1, outputs)
             grad.zero_() if grad_out is None else grad.copy_(grad_out[b, part])
             if grad_top is not None:
-                grad.scatter_add_(1, which[b, part].unsqueeze(1), grad_top[b, part].unsqueeze(1))
+                winner = which[b, part].long().unsqueeze(1)
+                grad.scatter_add_(1, winner, grad_top[b, part].unsqueeze(1))
             if out is not None:
                 active = out[b, part].flatten(0, 1)
                 if bend is not None and grad_total is not None:

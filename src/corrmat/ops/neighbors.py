@@ -12,6 +12,8 @@ _CHUNK = 2**24  # entries of a distance matrix that exist at once
 def knn(points: Tensor, k: int) -> Tensor:
     """The k nearest points of the same cloud, the point itself included.
 
+    No more than a slice of the distance matrix exists at a time.
+
     Args:
         points: (B, N, 3).
         k: how many, at most N.
@@ -24,7 +26,10 @@ def knn(points: Tensor, k: int) -> Tensor:
     """
     if points.shape[1] < k:
         raise ValueError(f"{k} neighbours asked of a cloud with {points.shape[1]} points")
-    return torch.cdist(points.float(), points.float()).topk(k, largest=False).indices
+    points = points.float()
+    rows = max(1, _CHUNK // max(1, points.shape[0] * points.shape[1]))
+    parts = [torch.cdist(x, points).topk(k, largest=False).indices for x in points.split(rows, 1)]
+    return torch.cat(parts, 1)
 
 
 @torch.no_grad()
