@@ -1,6 +1,7 @@
 """Smoke training of every experiment, and what a run promises besides its numbers."""
 
 import csv
+import dataclasses
 import io
 import json
 import math
@@ -70,6 +71,7 @@ def test_smoke_run_leaves_a_whole_record(identity, tmp_path, capsys):
     }
     record = json.loads((folder / "metrics.json").read_text())
     assert list(record["arms"]) == list(found.settings)
+    assert record["test_pairs"] == found.test_pairs
     bands = max(1, len(found.bands_deg) - 1)
     for arm in record["arms"].values():
         assert arm["pairs"] == 8 * bands
@@ -99,6 +101,12 @@ def test_the_same_command_gives_the_same_numbers_bit_for_bit(tmp_path):
     assert numbers(records[0]) == numbers(records[1])
     other = experiment.run(load("1.2", "--seed", "1"), tmp_path / "2", tmp_path / "runs")
     assert numbers(other) != numbers(records[0])
+
+
+def test_test_pairs_that_are_not_the_recipes_are_named(tmp_path, capsys):
+    found = dataclasses.replace(load("3.3", arms=["PCRNet_corr"]), test_pairs="others")
+    experiment.run(found, tmp_path / "results", tmp_path / "runs", "none")
+    assert "are not the recipe's (others)" in capsys.readouterr().out
 
 
 def test_per_pair_transforms_score_to_the_metrics_of_the_record(tmp_path):
