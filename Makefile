@@ -11,7 +11,9 @@ export PYTHONUNBUFFERED := 1
 unexport PYTHONDONTWRITEBYTECODE  # without byte code every command takes seconds longer
 BIN := .venv/bin
 EXPERIMENTS := exp1.1 exp1.2 exp1.3 exp1.4 exp2.1 exp2.2 exp2.3 exp2.4 exp3.1 exp3.2 exp3.3
-RUN_OPTIONS = --scale $(SCALE) --data.data $(DATA) $(if $(ROOT),--data.root "$(ROOT)") $(ARGS)
+OPTIONS = --scale $(SCALE) --data.data $(DATA) $(if $(ROOT),--data.root "$(ROOT)")
+# What a cluster has trained anew is not trained a second time to be tested.
+RUN_OPTIONS = $(OPTIONS) $(if $(filter ray,$(LAUNCHER)),$(filter-out --fresh,$(ARGS)),$(ARGS))
 
 .PHONY: help $(EXPERIMENTS) outliers robustness all on-ray weights protocols docs report bench lint format test test-slow lock clean
 
@@ -26,12 +28,12 @@ outliers: .venv/ready  ## DCP with outliers, three ways to their class (suppleme
 	$(BIN)/python reproduce/outliers.py $(RUN_OPTIONS)
 
 robustness: .venv/ready  ## figure 2: wrong matches against a wrong rotation vector, in seconds
-	$(BIN)/python reproduce/robustness.py --scale $(SCALE)
+	$(BIN)/python reproduce/robustness.py --scale $(SCALE) $(if $(filter all,$(MAKECMDGOALS)),,$(ARGS))
 
 all: $(if $(filter ray,$(LAUNCHER)),on-ray) robustness $(EXPERIMENTS) outliers  ## every experiment, figure 2 first; LAUNCHER=ray trains on a cluster
 
 on-ray: .venv/ready
-	$(BIN)/python reproduce/on_ray.py $(RUN_OPTIONS)
+	$(BIN)/python reproduce/on_ray.py $(OPTIONS) $(ARGS)
 
 weights: .venv/ready  ## train what `corrmat register` ships on the embedded shapes, put it into the package
 	$(BIN)/python reproduce/weights.py --scale $(SCALE) $(ARGS)
@@ -58,7 +60,7 @@ format: .venv/ready  ## let ruff rewrite what it can
 test: .venv/ready  ## everything but the slow learning tests, smoke training of every experiment included
 	$(BIN)/pytest
 
-test-slow: .venv/ready  ## the learning tests
+test-slow: .venv/ready  ## learning, kill -9 at any moment, SLURM, Ray, all checksums
 	$(BIN)/pytest -m slow
 
 lock: .venv/ready  ## compile requirements.lock anew from pyproject.toml

@@ -4,6 +4,7 @@ make protocols ROOT=folder-of-modelnet40
 """
 
 import argparse
+import sys
 from pathlib import Path
 
 from corrmat.cli import main
@@ -22,7 +23,9 @@ def run(root: Path | None) -> None:
                 words = ["--protocol", protocol, "--data", data, "--points", str(points)]
                 words += ["--root", str(root)] if data == "modelnet40" else []
                 path = RESULTS / f"{name}.json"
-                main(["evaluate", "--models", MODELS, *words, "--record", str(path)])
+                code = main(["evaluate", "--models", MODELS, *words, "--record", str(path)])
+                if code:
+                    sys.exit(code)
 
 
 if __name__ == "__main__":

@@ -1,17 +1,24 @@
-"""The weights that `corrmat register` ships: trained, calibrated, put into the package."""
+"""The weights that `corrmat register` ships: trained, calibrated, put into the package.
+
+Only what was trained at laptop scale on the embedded shapes is shipped; `make weights SCALE=smoke`
+sees whether everything runs.
+"""
 
 import sys
 from pathlib import Path
 
-from corrmat.cli import main
+from corrmat import recipe
+from corrmat.cli import main, parser
 from corrmat.shipping import ship
 
-ROOT = Path(__file__).resolve().parents[1]
-RECIPE = ROOT / "configs" / "weights.yaml"
+RECIPE = Path(__file__).resolve().parents[1] / "configs" / "weights.yaml"
 
 if __name__ == "__main__":
-    code = main(["fit", "--config", str(RECIPE), *sys.argv[1:]])
-    scale = "smoke" if "smoke" in sys.argv else "laptop"
-    if code == 0 and scale == "laptop":
-        ship(Path("runs", scale, "shapes", "weights", "Invariant_corr", "last.ckpt"))
+    words = ["fit", "--config", str(RECIPE), *sys.argv[1:]]
+    known, options = parser().parse_known_args(words)
+    code = main(words)
+    if code == 0 and not known.help:
+        found = recipe.load(RECIPE, known.scale, options)
+        if (found.scale, found.data) == ("laptop", "shapes"):
+            ship(known.runs / "laptop" / "shapes" / found.id / "Invariant_corr" / "last.ckpt")
     sys.exit(code)

@@ -87,6 +87,47 @@ def test_bad_commands_exit_with_2(words, capsys):
     assert "Traceback" not in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["evaluate", *FIT[1:], "--record", "x.json"], "--record goes with --models"),
+        (["evaluate", *FIT[1:], "--data", "modelnet40"], "--data goes with --models"),
+        (["evaluate", *FIT[1:], "--models", "icp"], "--config is of a recipe"),
+        (["evaluate", "--models", "icp", "--data.keep", "1"], "unknown option '--data.keep'"),
+        (["evaluate", "--models", "icp", "--record", "file/x.json"], "cannot write to file"),
+        ([*FIT, "--runs", "file/x"], "cannot write to file/x"),
+        ([*FIT, "--seed", "5000000000"], "seed 5000000000 is not between"),
+        (["robustness", "--scale", "smoke", "--results", "file/x"], "cannot write to file/x"),
+        (["data", "--root", "x"], "--root and --mirror are of modelnet40"),
+        (["data", "modelnet40", "--root", "x", "--sheet", "a.png"], "--sheet a.png: of shapes"),
+        (["data", "modelnet40", "--root", "file/x"], "file"),
+        (["register", "a.ply", "b.ply", "-o", "moved.xyz"], "written as PLY"),
+    ],
+)
+def test_what_would_do_nothing_or_fail_late_is_said_at_once(
+    words, message, capsys, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("not a folder")
+    assert main(words) == 2
+    shown = capsys.readouterr()
+    assert message in shown.err
+    assert len(shown.err.strip().splitlines()) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_fit_takes_an_arm_that_is_trained_and_evaluate_its_own_checkpoint(tmp_path, capsys):
+    """1.4 takes the networks of 1.1; one that it has trained itself goes first."""
+    own = [*FIT[1:], "--runs", str(tmp_path), "--trainer.max_steps", "2", "--arm", "DCP_corr"]
+    other = [word.replace("1.1.yaml", "1.4.yaml") for word in own]
+    assert main(["fit", *own]) == main(["fit", *own]) == main(["fit", *other]) == 0
+    assert capsys.readouterr().out.count("trained already: ") == 2
+    assert main(["evaluate", *other]) == 0
+    assert "/1.1/DCP_corr/best.ckpt" in capsys.readouterr().out
+    assert main(["fit", *other, "--fresh"]) == main(["evaluate", *other]) == 0
+    assert "checkpoint: " + str(tmp_path / "smoke/shapes/1.4/DCP_corr") in capsys.readouterr().out
+
+
 def test_a_checkpoint_of_another_network_is_refused(tmp_path, capsys):
     runs = ["--runs", str(tmp_path / "runs")]
     assert main([*FIT, *runs, "--trainer.max_steps", "1"]) == 0

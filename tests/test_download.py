@@ -41,6 +41,9 @@ class Server:
                 if how in ("404", "503"):
                     self.send_error(int(how))
                     return
+                if wanted and int(wanted[6:-1]) >= len(content):
+                    self.send_error(416)
+                    return
                 if wanted and how != "no ranges":
                     content, status = content[int(wanted[6:-1]) :], 206
                 if how == "wrong":
@@ -93,6 +96,22 @@ def test_a_second_run_goes_on_where_the_first_was_cut(server, tmp_path):
     fetch([server.url], path, DIGEST)
     assert server.ranges[-1] == "bytes=150000-"
     assert path.read_bytes() == CONTENT
+
+
+def test_a_run_killed_between_the_last_byte_and_the_move_starts_again(server, tmp_path):
+    path = tmp_path / "data.zip"
+    server.behave = ["cut", "404"]
+    with pytest.raises(CorrmatError, match="cut short"):
+        fetch([server.url], path, DIGEST)
+    (tmp_path / "data.zip.partial").write_bytes(CONTENT)
+    fetch([server.url], path, DIGEST)
+    assert server.ranges[-2:] == ["bytes=300000-", None]
+    assert path.read_bytes() == CONTENT
+
+
+def test_an_address_that_is_none_is_named(tmp_path):
+    with pytest.raises(CorrmatError, match="example.org/data.zip: unknown url type"):
+        fetch(["example.org/data.zip"], tmp_path / "data.zip")
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ import torch
 from conftest import ROOT, shared
 from rich.console import Console
 
-from corrmat import console, experiment, recipe
+from corrmat import console, experiment, page, recipe
 from corrmat.errors import CorrmatError
 from corrmat.module import RegistrationModule
 
@@ -192,6 +192,26 @@ def test_ctrl_c_and_the_same_command_end_as_if_nothing_had_been(
             for t in (tmp_path / "whole", folder)
         ]
         assert all(torch.equal(weights[0][key], weights[1][key]) for key in weights[0])
+
+
+def test_ctrl_c_in_the_last_step_stops_the_run_with_its_arm_trained(tmp_path, capsys):
+    settings, folder = load("1.1").settings["DCP"], tmp_path / "DCP"
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):  # noqa: PT012
+        press_ctrl_c("training_step", 7, patch)
+        train("DCP", settings, folder)
+    assert "stopping after this step" in capsys.readouterr().out
+    assert json.loads((folder / "trained.json").read_text())["pairs_seen"] == 32
+
+
+def test_a_network_that_the_paper_knows_nothing_of_leaves_a_record(tmp_path):
+    """Without a matrix to be looked at, and without a figure of the paper's to follow."""
+    options = ["--trainer.enable_progress_bar", "false"]
+    found = recipe.load(ROOT / "configs" / "weights.yaml", "smoke", options)
+    experiment.run(found, tmp_path / "results", tmp_path / "runs")
+    folder = tmp_path / "results" / "smoke" / "shapes" / found.id
+    assert (folder / "curves.png").is_file()
+    assert not (folder / "matches.png").exists()
+    assert "Invariant_corr" in page.build(tmp_path / "results")
 
 
 def test_other_settings_do_not_go_on_from_an_old_checkpoint(tmp_path, capsys):

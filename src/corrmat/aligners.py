@@ -72,6 +72,9 @@ class Learned:
     def __call__(self, source: np.ndarray, target: np.ndarray, seed: int) -> Guesses:
         """Guess at source (N, 6) and target (M, 6)."""
         x, y = (torch.from_numpy(np.asarray(c, np.float32)).unsqueeze(0) for c in (source, target))
+        least = int(getattr(self.network, "min_points", 3))
+        if min(x.shape[1], y.shape[1]) < least:
+            raise CorrmatError(f"this network needs clouds of at least {least} points")
         prediction = self.network(x, y)
         alone = _motion(prediction.rotation[0], prediction.translation[0])[None]
         if prediction.correspondence is None:

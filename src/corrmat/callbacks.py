@@ -67,7 +67,9 @@ class Curve(Callback):
             for k, v in trainer.callback_metrics.items()
             if k.startswith("val/")
         }
-        loss = float(trainer.strategy.reduce(torch.stack(self._losses).mean()))
+        # Those of a checkpoint lie on the CPU, wherever training goes on.
+        losses = torch.stack([loss.to(pl_module.device) for loss in self._losses])
+        loss = float(trainer.strategy.reduce(losses.mean()))
         self._losses.clear()
         self.points.append({"pairs_seen": self.pairs, "loss": loss} | {k: values[k] for k in SHOWN})
         line = (
@@ -133,12 +135,13 @@ class SaveOnInterrupt(Callback):
     """Ctrl-C or SIGTERM leaves a checkpoint between two steps and says how to go on.
 
     The signal is only noted; the step or validation under way is finished first, so that the
-    checkpoint holds a whole number of steps. A second Ctrl-C does not wait.
+    checkpoint holds a whole number of steps. A second Ctrl-C does not wait. Where no step is left,
+    training ends as usual, and `noted` says that somebody wants to stop.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._noted, self._hurried = False, False
+        self.noted, self._hurried = False, False
         self._before: dict[signal.Signals, Any] = {}
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
@@ -154,7 +157,7 @@ class SaveOnInterrupt(Callback):
         self, trainer: L.Trainer, pl_module: L.LightningModule, batch: PairBatch, batch_idx: int
     ) -> None:
         """Stop here, before the step has touched anything."""
-        if self._noted:
+        if self.noted:
             raise KeyboardInterrupt
 
     def on_exception(
@@ -163,7 +166,7 @@ class SaveOnInterrupt(Callback):
         """Lightning calls this before it gives up."""
         self._give_back()
         if isinstance(exception, KeyboardInterrupt):
-            if self._noted and not self._hurried and trainer.world_size == 1:
+            if self.noted and not self._hurried and trainer.world_size == 1:
                 # The batch under way does not count, or later validations come one too early.
                 total = trainer.fit_loop.epoch_loop.batch_progress.total
                 total.ready = total.completed
@@ -179,10 +182,10 @@ class SaveOnInterrupt(Callback):
         self._give_back()
 
     def _note(self, number: int, frame: object) -> None:
-        self._hurried = self._noted
+        self._hurried = self.noted
         if self._hurried:
             raise KeyboardInterrupt
-        self._noted = True
+        self.noted = True
         say("stopping after this step (once more to stop at once)")
 
     def _give_back(self) -> None:

@@ -61,6 +61,11 @@ Ctrl-C saves a checkpoint; the same command goes on from it.""",
     ),
 }
 
+# Options of `evaluate` that belong to --models, and what they are if not given.
+OF_MODELS = {
+    "protocol": "real", "data": "shapes", "root": None, "points": 512, "pairs": 120, "record": None,
+}  # fmt: skip
+
 REGISTER_EPILOG = """examples:
   corrmat register scan1.ply scan2.ply
       print the 4 x 4 matrix that takes scan1 onto scan2, and how far to trust it
@@ -89,6 +94,9 @@ def main(arguments: list[str] | None = None) -> int:
     except BrokenPipeError:  # whoever read our output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as error:  # a full disk, a folder that is somebody else's
+        print(f"corrmat: error: {error}", file=sys.stderr)
+        return 2
 
 
 def reproduce(experiment: str) -> None:
@@ -141,7 +149,7 @@ def parser() -> argparse.ArgumentParser:
     figure.add_argument("--scale", default="laptop", choices=["smoke", "laptop", "paper"],
         help="smoke: 20 draws a point of a curve instead of 400")  # fmt: skip
     figure.add_argument("--results", type=Path, default=Path("results"), help="folder of records")
-    figure.add_argument("--seed", type=int, default=0, help="of the draws")
+    figure.add_argument("--seed", type=_count, default=0, help="of the draws")
     data = commands.add_parser(
         "data", help="make the embedded data set, or fetch ModelNet40",
         epilog="examples:\n  corrmat data --sheet a.png\n  corrmat data modelnet40 --root /data",
@@ -165,6 +173,21 @@ def parser() -> argparse.ArgumentParser:
     completion = commands.add_parser("completion", help="print what makes a shell complete words")
     completion.add_argument("shell", choices=["bash", "zsh", "tcsh"])
     return found
+
+
+def _count(text: str) -> int:
+    """A seed or a number of things."""
+    value = int(text)
+    if not 0 <= value < 2**32:
+        raise argparse.ArgumentTypeError(f"{value} is not between 0 and 2^32")
+    return value
+
+
+def _positive(text: str) -> int:
+    value = _count(text)
+    if not value:
+        raise argparse.ArgumentTypeError("at least 1")
+    return value
 
 
 def _experiment_options(command: argparse.ArgumentParser, name: str) -> None:
@@ -208,19 +231,20 @@ def _experiment_options(command: argparse.ArgumentParser, name: str) -> None:
         )
         command.add_argument(
             "--protocol",
-            default="real",
             choices=["paper", "real", "clean"],
-            help="of --models. real: disjoint samples, noise, crop and outliers in both; "
+            help="of --models. real (default): disjoint samples, noise, crop and outliers in both; "
             "clean: without crop and outliers; paper: experiment 1.2's pairs",
         )
-        command.add_argument("--data", default="shapes", choices=["shapes", "modelnet40"],
-            help="of --models")  # fmt: skip
-        command.add_argument("--root", type=Path, help="folder of modelnet40, of --models")
-        command.add_argument("--points", type=int, default=512, help="a cloud, of --models")
-        command.add_argument("--pairs", type=int, default=120, help="of --models")
+        command.add_argument("--data", choices=["shapes", "modelnet40"],
+            help="of --models; default: shapes")  # fmt: skip
+        command.add_argument("--root", type=Path, help="of --models: folder of modelnet40")
+        command.add_argument("--points", type=_positive,
+            help="of --models: of a cloud before it is cropped; default: 512")  # fmt: skip
+        command.add_argument("--pairs", type=_positive, help="of --models; default: 120")
         command.add_argument(
-            "--record", type=Path, metavar="JSON", help="write table and per-pair values"
-        )
+            "--record", type=Path, metavar="JSON",
+            help="of --models: write table and per-pair values",
+        )  # fmt: skip
         command.add_argument(
             "--checkpoint", type=Path, help="default: best.ckpt of the arm's last fit or run"
         )
@@ -230,7 +254,8 @@ def _experiment_options(command: argparse.ArgumentParser, name: str) -> None:
 def _register_options(command: argparse.ArgumentParser) -> None:
     command.add_argument("source", type=Path, help="the cloud or mesh that is moved")
     command.add_argument("target", type=Path, help="the cloud or mesh that it is moved onto")
-    command.add_argument("-o", "--output", type=Path, metavar="PLY", help="write the moved source")
+    command.add_argument("-o", "--output", type=Path, metavar="PLY",
+        help="write the moved source (the points sampled on it, if it is a mesh)")  # fmt: skip
     command.add_argument("--json", type=Path, help="write matrix, confidence and verdict")
     command.add_argument("--html", type=Path, help="write a page: before, after, matches")
     command.add_argument(
@@ -241,13 +266,15 @@ def _register_options(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--refine", choices=["icp", "none"], default="icp", help="after the model's guess"
     )
-    command.add_argument("--seed", type=int, default=0, help="of subsampling and of draws")
+    command.add_argument("--seed", type=_count, default=0, help="of subsampling and of draws")
 
 
 def _register(known: argparse.Namespace) -> int:
     for path in (known.output, known.json, known.html):
         if path is not None and not path.parent.is_dir():
             raise CorrmatError(f"no folder {path.parent} to write {path.name} into")
+    if known.output is not None and known.output.suffix.lower() != ".ply":
+        raise CorrmatError(f"the moved source is written as PLY, {known.output} is named otherwise")
 
     from corrmat.data.scans import read_scan, write_ply
     from corrmat.files import replace_text
@@ -290,20 +317,25 @@ def _example(folder: Path) -> int:
 def _experiment(known: argparse.Namespace, options: list[str]) -> int:
     # Imported here, so that --help and mistakes do not wait for torch.
     from corrmat import console, experiment, metrics, recipe
+    from corrmat.files import ensure_writable
     from corrmat.methods import METHODS
 
     if known.help:
-        method = getattr(known, "arm", None) or "DCP_corr"
+        arm = getattr(known, "arm", None)
+        if known.config is not None:
+            arms = recipe.load(known.config, known.scale, [], [arm] if arm else None).settings
+            method = list(arms.values())[-1].method
+        else:
+            method = arm if arm in METHODS else "DCP_corr"
         print(known.usage_text)
-        print(
-            recipe.parser(method if method in METHODS else "DCP_corr")
-            .format_help()
-            .split("\n\n", 1)[1]
-        )
+        print(recipe.parser(method).format_help().split("\n\n", 1)[1])
         return 0
     if getattr(known, "models", None):
         _refuse(options)
         return _compare(known)
+    for name in OF_MODELS:
+        if getattr(known, name, None) is not None:
+            raise CorrmatError(f"--{name} goes with --models; a recipe's pairs are --data.*")
     if known.config is None:
         raise CorrmatError("which experiment? --config configs/exp/1.1.yaml")
     wanted = getattr(known, "arm", None)
@@ -320,12 +352,17 @@ def _experiment(known: argparse.Namespace, options: list[str]) -> int:
     folder = known.runs / found.scale / found.data / found.id / name
     if known.command == "fit":
         group = f"{found.scale}/{found.data}/{found.id}"
+        ensure_writable(folder)
+        trained = None if known.fresh else experiment.trained_already(found, arm, known.runs)
         with console.Board() as board:
-            trained = experiment.train(arm, folder, group, known.logger, board, fresh=known.fresh)
+            trained = trained or experiment.train(
+                arm, folder, group, known.logger, board, fresh=known.fresh
+            )
         print(f"best checkpoint: {trained.checkpoint}")
         return 0
-    checkpoint = known.checkpoint or experiment.best_checkpoint(found, name, known.runs)
+    checkpoint = known.checkpoint or experiment.best_checkpoint(found, arm, known.runs)
     module = experiment.trained_module(arm, checkpoint)
+    print(f"checkpoint: {checkpoint}")
     tests = experiment.score(module, arm, experiment.bands(found.bands_deg))
     for number, pairs in enumerate(tests):
         if found.bands_deg:
@@ -337,18 +374,30 @@ def _experiment(known: argparse.Namespace, options: list[str]) -> int:
 
 def _compare(known: argparse.Namespace) -> int:
     from corrmat import comparison
+    from corrmat.files import ensure_writable
 
-    of = {"protocol": known.protocol, "data": known.data, "points": known.points}
-    pairs = comparison.frozen_pairs(**of, root=known.root, count=known.pairs)
+    for name in ("config", "arm", "checkpoint"):
+        if getattr(known, name) is not None:
+            raise CorrmatError(f"--{name} is of a recipe; --models compares on a protocol's pairs")
+    given = {name: getattr(known, name) for name in OF_MODELS}
+    how = {name: OF_MODELS[name] if value is None else value for name, value in given.items()}
+    record, count, root = how.pop("record"), how.pop("pairs"), how.pop("root")
+    if record is not None:
+        ensure_writable(record.parent)
+    pairs = comparison.frozen_pairs(**how, root=root, count=count)
     found = comparison.compare(pairs, known.models.split(","))
     print(comparison.table(found))
-    if known.record is not None:
-        comparison.write(known.record, found, **of, pairs=len(pairs))
-        print(f"record: {known.record}")
+    if record is not None:
+        comparison.write(record, found, **how, pairs=len(pairs))
+        print(f"record: {record}")
     return 0
 
 
 def _data(known: argparse.Namespace) -> int:
+    if known.name == "shapes" and (known.root or known.mirror):
+        raise CorrmatError("--root and --mirror are of modelnet40: corrmat data modelnet40 ...")
+    if known.sheet is not None and (known.name != "shapes" or not known.sheet.parent.is_dir()):
+        raise CorrmatError(f"--sheet {known.sheet}: of shapes, and into a folder that is there")
     if known.name == "modelnet40":
         from corrmat import console
         from corrmat.data import modelnet40
@@ -394,8 +443,10 @@ def _completion(shell: str) -> int:
 
 def _robustness(scale: str, results: Path, seed: int) -> int:
     from corrmat import robustness
+    from corrmat.files import ensure_writable
 
     folder = results / scale / "robustness"
+    ensure_writable(folder)
     found = robustness.run(folder, draws=20 if scale == "smoke" else 400, seed=seed)
     print("rotation error, mean, deg, where so many per cent are corrupted:\n")
     print(robustness.terminal_table(found))

@@ -1,5 +1,6 @@
 """Many trainings at once: every arm of every experiment a task of a Ray cluster."""
 
+import argparse
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,7 +21,7 @@ def train(configs: Sequence[Path], words: Sequence[str]) -> None:
 
     Args:
         configs: experiments; those that test the networks of another one have nothing to train.
-        words: options of `corrmat fit`, for all arms.
+        words: options of `corrmat run`, for all arms.
 
     Raises:
         CorrmatError: Ray is missing, or an arm fails.
@@ -30,6 +31,9 @@ def train(configs: Sequence[Path], words: Sequence[str]) -> None:
         from ray.exceptions import RayError  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise CorrmatError("LAUNCHER=ray needs Ray: pip install 'corrmat[ray]'") from error
+    only_run = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    only_run.add_argument("--results")
+    _, words = only_run.parse_known_args(words)
     known, options = parser().parse_known_args(["fit", *words])
     found = [recipe.load(config, known.scale, options) for config in configs]
     arms = [

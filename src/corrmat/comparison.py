@@ -18,7 +18,7 @@ from corrmat.data.clouds import CloudSet
 from corrmat.data.pairs import STREAM, Key, PairSettings, Split, make_pairs
 from corrmat.errors import CorrmatError
 from corrmat.files import replace_text
-from corrmat.metrics import rotation_error_deg
+from corrmat.metrics import RECALL_DEG, rotation_error_deg
 from corrmat.registration import Refine, register
 from corrmat.types import PairBatch
 
@@ -39,7 +39,6 @@ PROTOCOLS: dict[str, PairSettings] = {
     # The same without crop and outliers.
     "clean": PairSettings(sampling="disjoint", jitter=0.01, normals="estimated"),
 }
-RECALL_DEG = 5.0
 NEAR = 0.03  # of the radius: mean distance below which aligned clean clouds agree (ADD-S)
 COLUMNS = {
     "mean_deg": "mean °",
@@ -92,6 +91,8 @@ def compare(pairs: PairBatch, models: Sequence[str], refine: Refine = "icp") -> 
     Returns:
         Of every model, the columns of the table and per-pair values.
     """
+    for model in models:  # one that cannot be had is known before the others have worked
+        _row(pairs, 0, model, refine)
     found = {}
     for model in models:
         rows = [

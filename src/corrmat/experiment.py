@@ -3,6 +3,7 @@
 import contextlib
 import ctypes
 import json
+import logging
 import pickle
 import shutil
 import warnings
@@ -34,6 +35,7 @@ from corrmat.methods import METHODS
 from corrmat.module import OptimizerSettings, RegistrationModule
 from corrmat.recipe import Recipe
 
+log = logging.getLogger("corrmat")
 Settings = Any  # jsonargparse.Namespace with seed, data, network, optimizer, trainer
 BEST = "val/rotation_error_deg_mean"
 _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # of glibc's malloc.h
@@ -66,6 +68,8 @@ def prepare(name: str, settings: Settings) -> Arm:
     Raises:
         CorrmatError: data that cannot be read, a network or Trainer that cannot be built.
     """
+    if not 0 <= settings.seed < 2**32:
+        raise CorrmatError(f"seed {settings.seed} is not between 0 and 2^32")
     arm = Arm(name, settings, make_datamodule(settings))
     make_module(settings)
     arm.datamodule.setup()
@@ -103,16 +107,16 @@ def run(
     ready = [prepare(name, settings) for name, settings in recipe.settings.items()]
     test_pairs = ready[0].datamodule.checksum(bands(recipe.bands_deg))
     if recipe.test_pairs not in (None, test_pairs):
-        say(
-            f"the test pairs made here ({test_pairs}) are not the recipe's ({recipe.test_pairs}): "
-            "numbers compare with other records in the mean only"
-        )
+        log.warning(
+            "the test pairs made here (%s) are not the recipe's (%s): numbers compare with other "
+            "records in the mean only", test_pairs, recipe.test_pairs,
+        )  # fmt: skip
     scores, rows, views = {}, [], []
     with Board() as board:
         for arm in ready:
             say(f"\n{recipe.id} {arm.name} ({recipe.scale}, {recipe.data})")
             folder = runs / place / arm.name
-            trained = None if fresh else _reusable(recipe, arm, runs)
+            trained = None if fresh else trained_already(recipe, arm, runs)
             trained = trained or train(arm, folder, str(place), logger, board, fresh=fresh)
             if not first_process():  # the others of a distributed run are there to train
                 continue
@@ -185,9 +189,9 @@ def train(
     """
     settings, datamodule = arm.settings, arm.datamodule
     module = _fresh(settings)
-    stored, text = folder / "settings.yaml", training_settings(arm)
+    text = training_settings(arm)
     last, done = folder / "last.ckpt", folder / "trained.json"
-    interrupted = stored.is_file() and not done.is_file() and stored.read_text() == text
+    interrupted = not done.is_file() and _settings(folder) == text
     start = _last_good(folder) if interrupted and not fresh else None
     if start is None:
         size, shapes = sum(p.numel() for p in module.parameters()), datamodule.clouds("train")
@@ -196,16 +200,16 @@ def train(
         if start is None:
             shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True, exist_ok=True)
-        replace_text(stored, text)
+        replace_text(folder / "settings.yaml", text)
     else:
         logger, board = "none", None
 
-    curve = Curve()
+    curve, interrupt = Curve(), SaveOnInterrupt(last)
     callbacks = [
         curve,
         ModelCheckpoint(folder, "best", monitor=BEST, enable_version_counter=False),
         ModelCheckpoint(folder, "last", enable_version_counter=False),
-        SaveOnInterrupt(last),
+        interrupt,
         *([Progress(board, arm.name, curve)] if board else []),
     ]
     config = report.plain(settings.as_dict())
@@ -235,6 +239,8 @@ def train(
         replace_text(
             done, json.dumps(asdict(trained) | {"checkpoint": trained.checkpoint.name}, indent=1)
         )
+    if interrupt.noted:
+        raise KeyboardInterrupt
     return trained
 
 
@@ -275,7 +281,7 @@ def score(
     Returns:
         Per-pair values of each set.
     """
-    alone = {"devices": 1, "num_nodes": 1, "strategy": "auto"}
+    alone = {"devices": 1, "num_nodes": 1, "strategy": "auto", "precision": "32-true"}
     quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
     trainer = L.Trainer(**{**trainer_options(arm.settings), **alone, **quiet})
     found = []
@@ -359,11 +365,12 @@ def _baseline(name: str, arm: Arm) -> RegistrationModule:
     return RegistrationModule(BASELINES[name](), OptimizerSettings())
 
 
-def best_checkpoint(recipe: Recipe, arm: str, runs: Path) -> Path:
-    """Where the best weights of an arm lie: its own, or those of `networks_of`."""
-    folder = runs / recipe.scale / recipe.data
-    places = [folder / i / arm / "best.ckpt" for i in (recipe.networks_of, recipe.id) if i]
-    return next((path for path in places if path.is_file()), places[-1])
+def best_checkpoint(recipe: Recipe, arm: Arm, runs: Path) -> Path:
+    """Where the best weights of an arm lie: its own, or the same arm's of `networks_of`."""
+    own, *others = _folders(recipe, arm, runs)
+    same = [folder for folder in others if _settings(folder) == training_settings(arm)]
+    found = [folder / "best.ckpt" for folder in (own, *same)]
+    return next((path for path in found if path.is_file()), found[0])
 
 
 def load_weights(module: RegistrationModule, checkpoint: Path) -> None:
@@ -470,18 +477,28 @@ def _progress(checkpoint: Path, datamodule: RegistrationDataModule) -> dict[str,
     return {"epoch": content["epoch"], "done": seen * datamodule.batch_size}
 
 
-def _reusable(recipe: Recipe, arm: Arm, runs: Path) -> Trained | None:
-    """The same arm, already trained to the end with the same settings.
+def trained_already(recipe: Recipe, arm: Arm, runs: Path) -> Trained | None:
+    """The same arm, trained to the end with the same settings before.
 
-    Either by the experiment that `networks_of` names, or by this one, if it was stopped
-    before its record was written.
+    Either by this experiment, if its record is not written yet, or by the one that `networks_of`
+    names.
     """
-    for identity in filter(None, (recipe.networks_of, recipe.id)):
-        folder = runs / recipe.scale / recipe.data / identity / arm.name
-        done, stored = folder / "trained.json", folder / "settings.yaml"
-        recorded = identity == recipe.id and (folder / RECORDED).exists()
-        if done.is_file() and not recorded and stored.read_text() == training_settings(arm):
+    own, *others = _folders(recipe, arm, runs)
+    for folder in (*([] if (own / RECORDED).exists() else [own]), *others):
+        done = folder / "trained.json"
+        if done.is_file() and _settings(folder) == training_settings(arm):
             say(f"trained already: {folder}")
             content = json.loads(done.read_text())
             return Trained(**content | {"checkpoint": folder / content["checkpoint"]})
     return None
+
+
+def _folders(recipe: Recipe, arm: Arm, runs: Path) -> list[Path]:
+    """Where an arm is trained: by this experiment, and by the one that `networks_of` names."""
+    identities = filter(None, (recipe.id, recipe.networks_of))
+    return [runs / recipe.scale / recipe.data / identity / arm.name for identity in identities]
+
+
+def _settings(folder: Path) -> str | None:
+    stored = folder / "settings.yaml"
+    return stored.read_text() if stored.is_file() else None

@@ -15,6 +15,7 @@ PANELS = {
     "RPMNet": ("loss", "match_accuracy", "rotation_error_deg_mean", "chamfer"),
     "PCRNet": ("loss", "match_accuracy", "naive_euler_rmse_deg", "rotation_error_deg_mean"),
 }
+OWN = ("loss", "match_accuracy", "rotation_error_deg_mean", "translation_rmse")
 COLOURS = ("#d62728", "#1f77b4", "#2ca02c", "#9467bd")  # METHOD red, METHOD_corr blue: the paper's
 LINES = 150  # matches drawn, at most
 
@@ -25,7 +26,7 @@ def curves_figure(record: Mapping[str, Any], path: Path) -> None:
     Validation metrics against pairs seen; the paper's final values as dotted lines.
     """
     arms = record["arms"]
-    panels = PANELS[family(record)]
+    panels = PANELS.get(family(record), OWN)
     figure = Figure(figsize=(15, 3.6), layout="constrained")
     figure.suptitle(f"{record['id']}  {record['title']}  ({record['scale']}, {record['data']})")
     for axes, name in zip(figure.subplots(1, len(panels)), panels, strict=True):

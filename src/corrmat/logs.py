@@ -4,7 +4,7 @@ import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 from lightning.pytorch.loggers import CSVLogger, Logger, WandbLogger
@@ -12,7 +12,6 @@ from lightning.pytorch.loggers import CSVLogger, Logger, WandbLogger
 from corrmat import report
 
 Choice = Literal["none", "csv", "wandb"]
-CHOICES: tuple[Choice, ...] = get_args(Choice)
 
 
 def loggers(
@@ -61,11 +60,11 @@ def send_record(
     config = {name: record[name] for name in ("id", "title", "scale", "data", "seed", "commit")}
     started = _start(run, "record", group, config)
     heads, rows = report.table(record)
+    pictures = [at / "curves.png", *([at / "matches.png"] if views else [])]
     started.log(
         {
             "table": wandb.Table(columns=["metric", *heads[1:]], data=rows),
-            "curves": wandb.Image(str(at / "curves.png")),
-            "matches": wandb.Image(str(at / "matches.png")),
+            **{picture.stem: wandb.Image(str(picture)) for picture in pictures},
             **{f"pair/{view['rank']}": wandb.Object3D(_cloud(view)) for view in views},
         }
     )

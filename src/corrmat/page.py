@@ -15,7 +15,7 @@ import numpy as np
 from plotly.offline import get_plotlyjs
 
 from corrmat import report
-from corrmat.figures import COLOURS, PANELS
+from corrmat.figures import COLOURS, OWN, PANELS
 
 GREEN, RED, BLUE = "#2ca02c", "#d62728", "#1f77b4"
 # What a family's numbers depend on, below src/corrmat; the recipes come on top.
@@ -23,7 +23,7 @@ CODE = (
     "ops/rigid.py", "ops/correspondence.py", "ops/streaming.py", "ops/sinkhorn.py",
     "ops/neighbors.py", "data/pairs.py", "data/datamodule.py", "data/clouds.py",
     "data/normals.py", "data/modelnet40.py", "data/shapes.py", "data/families.py",
-    "data/solids.py", "losses.py", "module.py",
+    "data/solids.py", "losses.py", "module.py", "metrics.py", "baselines.py",
 )  # fmt: skip
 FAMILY_CODE = {
     "DCP": (
@@ -100,7 +100,7 @@ def staleness(record: Mapping[str, Any], repository: Path) -> str:
         repository: a checkout that knows them.
     """
     family = report.family(record)
-    code = [f"src/corrmat/{name}" for name in (*CODE, *FAMILY_CODE[family])]
+    code = [f"src/corrmat/{name}" for name in (*CODE, *FAMILY_CODE.get(family, ()))]
     code += [f"configs/exp/{record['id']}.yaml", f"configs/{family.lower()}.yaml"]
     arms = record["arms"].values()
     commits = {str(arm.get("trained_at") or record.get("commit")) for arm in arms}
@@ -108,10 +108,15 @@ def staleness(record: Mapping[str, Any], repository: Path) -> str:
         return "trained with uncommitted code"
     changed: set[str] = set()
     for commit in commits:
-        found = subprocess.run(
-            ["git", "diff", "--name-only", commit, "--", *code],
-            cwd=repository, capture_output=True, text=True,
-        )  # fmt: skip
+        # Lines that are blank or hold a comment change no number.
+        lines = "-G^[[:space:]]*[^#[:space:]]"
+        try:
+            found = subprocess.run(
+                ["git", "diff", "--name-only", lines, commit, "--", *code],
+                cwd=repository, capture_output=True, text=True,
+            )  # fmt: skip
+        except OSError:
+            return "git is not at hand, so nobody can tell whether the code has changed"
         if found.returncode:
             return (
                 f"commit {commit} is not at hand, so nobody can tell whether the code has changed"
@@ -125,7 +130,8 @@ def _summary(records: Sequence[Mapping[str, Any]]) -> str:
     heads += ["paper METHOD", "paper METHOD_corr", "paper ratio"]
     rows = []
     for record in sorted(records, key=lambda r: (r["id"], r["scale"], r["data"])):
-        for metric in ("match_accuracy", report.PAPERS_OWN[report.family(record)]):
+        own = report.PAPERS_OWN.get(report.family(record), report.SOUND)
+        for metric in ("match_accuracy", own):
             ours = [report.value_of(a, metric) for a in list(record["arms"].values())[:2]]
             paper = [report.value_of(record["paper"].get(a, {}), metric) for a in record["arms"]][
                 :2
@@ -182,7 +188,7 @@ def _provenance(record: Mapping[str, Any], source: str) -> str:
 
 
 def _curves(record: Mapping[str, Any]) -> dict[str, Any]:
-    panels = PANELS[report.family(record)]
+    panels = PANELS.get(report.family(record), OWN)
     data: list[dict[str, Any]] = []
     layout: dict[str, Any] = {
         "grid": {"rows": 1, "columns": len(panels), "pattern": "independent"},

@@ -104,6 +104,8 @@ def load(path: Path, scale: str, options: list[str], arms: list[str] | None = No
     for key in ("id", "title", "arms"):
         if key not in merged:
             raise CorrmatError(f"{path} lacks {key!r}")
+    if not isinstance(merged["arms"], dict):
+        raise CorrmatError(f"{path}: arms must be names with settings, e.g. arms: {{DCP: {{}}}}")
     chosen = merged["arms"] if arms is None else {a: merged["arms"].get(a) for a in arms}
     settings = {}
     for arm, own in chosen.items():
@@ -123,7 +125,7 @@ def load(path: Path, scale: str, options: list[str], arms: list[str] | None = No
         settings=settings,
         bands_deg=tuple(merged.get("bands_deg", ())),
         sweep_outliers=tuple(merged.get("sweep_outliers", ())),
-        networks_of=merged.get("networks_of"),
+        networks_of=str(merged["networks_of"]) if "networks_of" in merged else None,
         baselines=_known_baselines(merged.get("baselines", ()), path),
         test_pairs=_checksum(merged, scale, settings, options),
     )

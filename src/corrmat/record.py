@@ -144,13 +144,17 @@ def write(
     config = {"id": recipe.id, "scale": recipe.scale, "arms": settings}
     (partial / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
     figures.curves_figure(record, partial / "curves.png")
-    (partial / "views.json").write_text(json.dumps(views) + "\n")
-    middle = views[len(views) // 2]
-    figures.matches_figure(middle, _title(record, middle), partial / "matches.png")
+    if views:
+        (partial / "views.json").write_text(json.dumps(views) + "\n")
+        middle = views[len(views) // 2]
+        figures.matches_figure(middle, _title(record, middle), partial / "matches.png")
     (partial / "metrics.json").write_text(json.dumps(_finite(record), indent=1) + "\n")
     folder.mkdir(parents=True, exist_ok=True)
     for name in FILES:
-        (partial / name).replace(folder / name)
+        if (partial / name).exists():
+            (partial / name).replace(folder / name)
+        else:  # of a network without matches
+            (folder / name).unlink(missing_ok=True)
     partial.rmdir()
 
 
@@ -178,6 +182,7 @@ def commit() -> str | None:
         ).stdout
 
     try:
+        git("ls-files", "--error-unmatch", Path(__file__).name)  # not somebody else's checkout
         changed = git("status", "--porcelain", "--", ".", "../../configs")
         return git("rev-parse", "--short=12", "HEAD").strip() + ("+" if changed.strip() else "")
     except (OSError, subprocess.CalledProcessError):

@@ -24,11 +24,17 @@ def ship(checkpoint: Path) -> None:
     state = {name: tensor.contiguous() for name, tensor in network.state_dict().items()}
     about = {"method": method, "network": json.dumps(hparams), "commit": str(record.commit())}
     SHIPPED.parent.mkdir(exist_ok=True)
-    # The weights are registered with before anybody knows how far to trust them.
-    about["calibration"] = json.dumps({"both": [1, 1, -1], "agreement": [1, -0.5]})
-    replace_bytes(SHIPPED, safetensors.torch.save(state, about))
-    about["calibration"] = json.dumps(calibrate())
-    replace_bytes(SHIPPED, safetensors.torch.save(state, about))
+    before = SHIPPED.read_bytes() if SHIPPED.is_file() else None
+    try:
+        # The weights are registered with before anybody knows how far to trust them.
+        about["calibration"] = json.dumps({"both": [1, 1, -1], "agreement": [1, -0.5]})
+        replace_bytes(SHIPPED, safetensors.torch.save(state, about))
+        about["calibration"] = json.dumps(calibrate())
+        replace_bytes(SHIPPED, safetensors.torch.save(state, about))
+    except BaseException:  # Ctrl-C as well: weights that nobody has judged are not left there
+        if before is not None:
+            replace_bytes(SHIPPED, before)
+        raise
     print(f"{SHIPPED}: {SHIPPED.stat().st_size / 1e6:.1f} MB")
 
 

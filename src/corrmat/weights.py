@@ -113,7 +113,7 @@ def load_model(model: str | Path = "corrmat") -> nn.Module:
         return _filled(network, safetensors.torch.load_file(SHIPPED))
     path = Path(model)
     state = _tensors(path)
-    if all(name.startswith("network.") for name in state):
+    if state and all(name.startswith("network.") for name in state):
         return own_checkpoint(path)[2]
     return load_reference(_kind_of(path, state), state)
 
@@ -157,14 +157,18 @@ def own_checkpoint(path: Path) -> tuple[str, dict[str, Any], nn.Module]:
     settings = path.parent / "settings.yaml"
     if not settings.is_file():
         raise CorrmatError(f"{path} is a checkpoint of corrmat, but {settings} is not beside it")
-    about = yaml.safe_load(settings.read_text())
-    method, hparams = about["method"], about["network"]
+    try:
+        about = yaml.safe_load(settings.read_text())
+        method, hparams = about["method"], about["network"]
+        network = METHODS[method].network_type(**hparams)
+    except (yaml.YAMLError, KeyError, TypeError, ValueError) as error:
+        raise CorrmatError(f"{settings} does not say which network {path} is of") from error
     own = {
         name.removeprefix("network."): value
         for name, value in _tensors(path).items()
         if name.startswith("network.")
     }
-    return method, hparams, _filled(METHODS[method].network_type(**hparams), own)
+    return method, hparams, _filled(network, own)
 
 
 def _kind_of(path: Path, state: State) -> str:

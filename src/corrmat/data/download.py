@@ -66,12 +66,15 @@ def fetch(
                     replace_text(trusted, f"{digest}  {path.name}\n")
                 return
             except urllib.error.HTTPError as error:
+                if error.code == 416:  # nothing is left to send: what is here is not its file
+                    _drop(path)
+                    continue
                 failures.append(f"{mirror}: HTTP {error.code} {error.reason}")
                 break
             except CorrmatError as error:
                 failures.append(f"{mirror}: {error}")
                 break
-            except (OSError, HTTPException) as error:
+            except (OSError, HTTPException, ValueError) as error:
                 failures.append(f"{mirror}: {error or type(error).__name__}")
     raise CorrmatError(f"cannot fetch {path.name}: " + "; ".join(dict.fromkeys(failures)))
 
@@ -95,17 +98,19 @@ def unzip(archive: Path, folder: Path, name: str) -> None:
                     raise CorrmatError(f"{archive}: {member.filename!r} is a link")
             damaged = file.testzip()
             if damaged:
-                raise CorrmatError(f"{archive}: {damaged} is damaged; delete it and fetch it again")
+                raise CorrmatError(f"{archive}: {damaged} is damaged; {_again(archive)}")
             file.extractall(aside)
         if not (aside / name).is_dir():
             raise CorrmatError(f"{archive} does not hold the folder {name}")
         (aside / name).replace(folder / name)
     except zipfile.BadZipFile as error:
-        raise CorrmatError(
-            f"{archive} is no whole zip file; delete it and fetch it again"
-        ) from error
+        raise CorrmatError(f"{archive} is no whole zip file; {_again(archive)}") from error
     finally:
         shutil.rmtree(aside, ignore_errors=True)
+
+
+def _again(archive: Path) -> str:
+    return f"delete it and {archive.name}.sha256, and fetch it again"
 
 
 def _go_on(mirror: str, path: Path, timeout: float) -> None:
