@@ -1,6 +1,6 @@
 """Search the lengths of the classical pipelines, in good faith, on validation pairs.
 
-    python benchmarks/tune_classical.py        minutes; needs pip install 'corrmat[baselines]'
+    python benchmarks/tune_classical.py        minutes; needs pip install open3d
 
 The best settings are `RANSAC` and `FGR` in corrmat.aligners; all that were tried,
 with their recalls, are in results/register/tuning.json.

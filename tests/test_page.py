@@ -116,6 +116,8 @@ def test_a_record_whose_code_has_changed_is_marked(tmp_path):
     assert page.staleness(found, tmp_path) == ""
     (tmp_path / "README.md").write_text("words change nothing\n")
     assert page.staleness(found, tmp_path) == ""
+    code.write_text("# nor does a comment\n\na = 1\n")
+    assert page.staleness(found, tmp_path) == ""
     code.write_text("a = 2\n")
     assert page.staleness(found, tmp_path) == "changed since: losses.py"
     arms["DCP"]["trained_at"] += "+"

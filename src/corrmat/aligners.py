@@ -166,9 +166,7 @@ def _features(
     try:
         o3d: Any = importlib.import_module("open3d")
     except ImportError as error:
-        raise CorrmatError(
-            "ransac and fgr are Open3D's: pip install 'corrmat[baselines]'"
-        ) from error
+        raise CorrmatError("ransac and fgr are Open3D's: pip install open3d") from error
     clouds, features = [], []
     for points in (source, target):
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[:, :3].astype(float)))

@@ -72,7 +72,7 @@ REGISTER_EPILOG = """examples:
   corrmat register part.stl scan.pcd -o aligned.ply --json T.json --html view.html
       write the moved source, the result for programs, and a page to look at
   corrmat register a.npy b.npy --model ransac
-      the classical pipeline instead (pip install 'corrmat[baselines]')
+      the classical pipeline instead (pip install open3d)
 
 Files: PLY, OBJ, STL, OFF, GLB, GLTF (meshes are sampled, scenes merged), PCD, XYZ, TXT, CSV,
 NPY, NPZ. Any units, as long as both files have the same. Parts may be missing from either.
@@ -156,7 +156,7 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=raw,
     )  # fmt: skip
     data.add_argument("name", nargs="?", default="shapes", choices=["shapes", "modelnet40"])
-    data.add_argument("--root", type=Path, help="modelnet40: folder to fetch it into (2 GB)")
+    data.add_argument("--root", type=Path, help="modelnet40: folder to fetch it into")
     data.add_argument("--mirror", action="append", metavar="URL",
         help="modelnet40: where its zip is; may be given more than once")  # fmt: skip
     data.add_argument("--sheet", type=Path, metavar="PNG", help="draw one shape of every family")

@@ -30,7 +30,7 @@ def train(configs: Sequence[Path], words: Sequence[str]) -> None:
         import ray  # pyright: ignore[reportMissingImports] (an extra)
         from ray.exceptions import RayError  # pyright: ignore[reportMissingImports]
     except ImportError as error:
-        raise CorrmatError("LAUNCHER=ray needs Ray: pip install 'corrmat[ray]'") from error
+        raise CorrmatError("LAUNCHER=ray needs Ray: pip install ray") from error
     only_run = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     only_run.add_argument("--results")
     _, words = only_run.parse_known_args(words)
