@@ -99,6 +99,7 @@ def test_layers_lie_over_each_other(tmp_path):
         ("id: [", "is not YAML"),
         ("- 3\n", "holds no settings"),
         ("title: t\narms: {DCP: {}}\n", "lacks 'id'"),
+        ("id: x\ntitle: t\narms: [DCP]\n", "arms must be names with settings"),
         ("id: x\ntitle: t\n", "lacks 'arms'"),
         ("id: x\ntitle: t\nbase: nowhere.yaml\n", "no recipe .*nowhere.yaml"),
     ],

@@ -20,7 +20,7 @@ from corrmat.figures import COLOURS, OWN, PANELS
 GREEN, RED, BLUE = "#2ca02c", "#d62728", "#1f77b4"
 # What a family's numbers depend on, below src/corrmat; the recipes come on top.
 CODE = (
-    "ops/rigid.py", "ops/correspondence.py", "ops/streaming.py", "ops/sinkhorn.py",
+    "ops/rigid.py", "ops/correspondence.py", "ops/streaming.py",
     "ops/neighbors.py", "data/pairs.py", "data/datamodule.py", "data/clouds.py",
     "data/normals.py", "data/modelnet40.py", "data/shapes.py", "data/families.py",
     "data/solids.py", "losses.py", "module.py", "metrics.py", "baselines.py",
@@ -35,6 +35,7 @@ FAMILY_CODE = {
     ),
     "RPMNet": (
         "networks/rpmnet.py",
+        "ops/sinkhorn.py",
         "networks/edges.py",
         "networks/ppf.py",
         "networks/pointnet.py",
@@ -355,8 +356,9 @@ def _robustness(results: Path, plots: Plots) -> str:
         layout = axes | {"yaxis": {"title": {"text": "rotation error, mean, deg"}}}
         plots[name] = {"data": data, "layout": layout}
         source = f"results/{path.parts[-3]}/robustness/curve.json"
+        made_by = f"make robustness SCALE={path.parts[-3]}"
         facts = f"{record['draws']} draws a point, seed {record['seed']}. File: {source}"
-        parts.append(f'<p class="from"><code>make robustness</code>. {escape(facts)}</p>')
+        parts.append(f'<p class="from"><code>{made_by}</code>. {escape(facts)}</p>')
         parts.append(_plot(name, "Rotation error against per cent corrupted"))
     title = "Figure 2: wrong matches against a wrong rotation vector"
     return f'<section id="robustness"><h2>{title}</h2>{"".join(parts)}</section>'
