@@ -81,10 +81,6 @@ def main() -> None:
         if method in ("DCP_corr", "RPMNet_corr"):
             row |= in_a_process(against_released, method, hparams, n, batch)
         add(f"step of {method}, {size}, N={n}, batch {batch}", row)
-    for method, hparams, n, batch in STEPS:
-        if n * batch <= 512:  # the laptop's steps; on larger ones products decide
-            row = in_a_process(against_compiled, method, hparams, n, batch)
-            add(f"step of {method}, N={n}, batch {batch}, by torch.compile", row)
     for method in ("DCP_corr", "RPMNet_corr", "PCRNet_corr"):
         add(f"one pair through {method}, N=1024", in_a_process(inference, method))
     add("one pair through FPFH + RANSAC, N=1024", in_a_process(classical, "ransac"))
@@ -155,25 +151,6 @@ def against_released(method: str, hparams: dict[str, Any], n: int, batch: int) -
     both = [lambda: step(ours(module, pairs)), lambda: step(released())]
     own, other = median(both, 1 if n * batch > 2000 else 9)
     return {"released_ratio": round(other / own, 2), "released_peak_mb": round(peak_mb() - held)}
-
-
-def against_compiled(method: str, hparams: dict[str, Any], n: int, batch: int) -> Row:
-    """What torch.compile makes of a step, and how many times longer the step takes without."""
-    pairs, module, step = build(method, hparams, n, batch)
-    start = time.perf_counter()
-    network = torch.compile(module.network)
-
-    def compiled() -> torch.Tensor:
-        return module.loss(network(pairs.source, pairs.target), pairs)
-
-    try:
-        step(compiled())
-    except Exception as error:  # noqa: BLE001 (the compiler's many)
-        return {"cannot": type(error).__name__}
-    seconds = time.perf_counter() - start
-    both = [lambda: step(compiled()), lambda: step(ours(module, pairs))]
-    own, plain = median(both, 20)
-    return {"seconds_to_compile": round(seconds), "plain_ratio": round(plain / own, 2)}
 
 
 @torch.no_grad()
