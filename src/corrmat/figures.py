@@ -15,9 +15,14 @@ PANELS = {
     "RPMNet": ("loss", "match_accuracy", "rotation_error_deg_mean", "chamfer"),
     "PCRNet": ("loss", "match_accuracy", "naive_euler_rmse_deg", "rotation_error_deg_mean"),
 }
-OWN = ("loss", "match_accuracy", "rotation_error_deg_mean", "translation_rmse")
 COLOURS = ("#d62728", "#1f77b4", "#2ca02c", "#9467bd")  # METHOD red, METHOD_corr blue: the paper's
 LINES = 150  # matches drawn, at most
+
+
+def panels_of(record: Mapping[str, Any]) -> tuple[str, ...]:
+    """What the curves of a record show: the paper's columns, or those of a network of one's own."""
+    own = ("loss", "match_accuracy", "rotation_error_deg_mean", "translation_rmse")
+    return PANELS.get(family(record), own)
 
 
 def curves_figure(record: Mapping[str, Any], path: Path) -> None:
@@ -26,7 +31,7 @@ def curves_figure(record: Mapping[str, Any], path: Path) -> None:
     Validation metrics against pairs seen; the paper's final values as dotted lines.
     """
     arms = record["arms"]
-    panels = PANELS.get(family(record), OWN)
+    panels = panels_of(record)
     figure = Figure(figsize=(15, 3.6), layout="constrained")
     figure.suptitle(f"{record['id']}  {record['title']}  ({record['scale']}, {record['data']})")
     for axes, name in zip(figure.subplots(1, len(panels)), panels, strict=True):

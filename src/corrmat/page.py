@@ -15,7 +15,7 @@ import numpy as np
 from plotly.offline import get_plotlyjs
 
 from corrmat import report
-from corrmat.figures import COLOURS, OWN, PANELS
+from corrmat.figures import COLOURS, panels_of
 
 GREEN, RED, BLUE = "#2ca02c", "#d62728", "#1f77b4"
 # What a family's numbers depend on, below src/corrmat; the recipes come on top.
@@ -131,8 +131,7 @@ def _summary(records: Sequence[Mapping[str, Any]]) -> str:
     heads += ["paper METHOD", "paper METHOD_corr", "paper ratio"]
     rows = []
     for record in sorted(records, key=lambda r: (r["id"], r["scale"], r["data"])):
-        own = report.PAPERS_OWN.get(report.family(record), report.SOUND)
-        for metric in ("match_accuracy", own):
+        for metric in ("match_accuracy", report.papers_own(record)):
             ours = [report.value_of(a, metric) for a in list(record["arms"].values())[:2]]
             paper = [report.value_of(record["paper"].get(a, {}), metric) for a in record["arms"]][
                 :2
@@ -189,7 +188,7 @@ def _provenance(record: Mapping[str, Any], source: str) -> str:
 
 
 def _curves(record: Mapping[str, Any]) -> dict[str, Any]:
-    panels = PANELS.get(report.family(record), OWN)
+    panels = panels_of(record)
     data: list[dict[str, Any]] = []
     layout: dict[str, Any] = {
         "grid": {"rows": 1, "columns": len(panels), "pattern": "independent"},

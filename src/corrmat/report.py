@@ -38,12 +38,16 @@ PAPERS_OWN = {
     "RPMNet": "rotation_error_deg_mean",
     "PCRNet": "naive_euler_rmse_deg",
 }
-SOUND = "rotation_error_deg_mean"  # for networks that the paper knows nothing of
 
 
 def family(record: Mapping[str, Any]) -> str:
     """What a record's arms are variants of: DCP, RPMNet, PCRNet, or a network of one's own."""
     return next(iter(record["arms"])).split("_")[0]
+
+
+def papers_own(record: Mapping[str, Any]) -> str:
+    """What the paper calls a record's rotation error; the sound one for a network of one's own."""
+    return PAPERS_OWN.get(family(record), "rotation_error_deg_mean")
 
 
 def table(record: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
@@ -119,7 +123,7 @@ def _pairwise(record: Mapping[str, Any], arms: Sequence[Mapping[str, Any]]) -> l
     """Cells "METHOD → METHOD_corr"; empty where neither has a number."""
     names = ["match_accuracy", "rotation_error_deg_mean", "rotation_error_deg_median"]
     cells = []
-    for name in [*names, PAPERS_OWN.get(family(record), SOUND)]:
+    for name in [*names, papers_own(record)]:
         values = [value_of(found, name) for found in arms]
         shown = [cell(value, name) or "-" for value in values]
         cells.append(" → ".join(shown) if set(shown) != {"-"} else "")
