@@ -79,7 +79,7 @@ def build(results: Path) -> str:
         ),
         nav=f'<a href="#summary">summary</a>{nav}<a href="#robustness">figure 2</a>',
         body="\n".join(sections),
-        plots=json.dumps(plots).replace("</", "<\\/"),
+        plots=json.dumps(plots, separators=(",", ":")).replace("</", "<\\/"),
         plotly=get_plotlyjs(),
     )
 
