@@ -15,7 +15,7 @@ OPTIONS = --scale $(SCALE) --data.data $(DATA) $(if $(ROOT),--data.root "$(ROOT)
 # What a cluster has trained anew is not trained a second time to be tested.
 RUN_OPTIONS = $(OPTIONS) $(if $(filter ray,$(LAUNCHER)),$(filter-out --fresh,$(ARGS)),$(ARGS))
 
-.PHONY: help $(EXPERIMENTS) outliers robustness all on-ray weights protocols docs report bench lint format test test-slow lock clean
+.PHONY: help $(EXPERIMENTS) outliers robustness all on-ray weights protocols docs report bench lint format test test-slow test-oldest lock clean
 
 help:  ## list the targets
 	@echo "make TARGET [SCALE=smoke|laptop|paper] [DATA=shapes|modelnet40] [ROOT=folder] [ARGS='--key value']"
@@ -63,12 +63,17 @@ test: .venv/ready  ## everything but the slow learning tests, smoke training of 
 test-slow: .venv/ready  ## learning, kill -9 at any moment, SLURM, Ray, all checksums
 	$(BIN)/pytest -m slow
 
+test-oldest: .venv/ready  ## the same on the oldest versions that pyproject.toml allows
+	$(BIN)/uv venv --clear --quiet --python $(BIN)/python .venv-oldest
+	$(BIN)/uv pip install --quiet --python .venv-oldest/bin/python --resolution lowest-direct '.[dev]'
+	.venv-oldest/bin/python -m pytest
+
 lock: .venv/ready  ## compile requirements.lock anew from pyproject.toml
 	$(BIN)/uv pip compile pyproject.toml --extra dev --universal --python-version 3.11 \
 		--generate-hashes --no-header --quiet --upgrade --output-file requirements.lock
 
 clean:  ## remove the environment and all runs (results/ stays)
-	rm -rf .venv runs
+	rm -rf .venv .venv-oldest runs
 
 .venv/ready: requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "corrmat needs Python 3.11 or newer; name one with PYTHON=...")'

@@ -49,11 +49,11 @@ def test_help_of_a_command_lists_typed_settings(capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--data.nump", "3"], "unrecognized arguments: --data.nump 3"),
+        (["--data.nump", "3"], "nrecognized arguments: --data.nump 3"),
         (["--data.num_points", "many"], "data.num_points"),
         (["--data.sampling", "some"], "identical"),
         (["--data.keep", "7"], "keep = 7.0 is out of range"),
-        (["--trainer.max_stepz", "3"], "unrecognized arguments: --trainer.max_stepz"),
+        (["--trainer.max_stepz", "3"], "nrecognized arguments: --trainer.max_stepz"),
         (["--network.width", "33"], "width 33 is not a multiple of 4 heads"),
         (["--network.k", "60"], "too small for DCP_corr, which needs 60"),
         (["--data.num_points", "5000"], "have 2048 points"),

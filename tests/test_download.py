@@ -3,7 +3,11 @@
 import hashlib
 import http.server
 import io
+import shutil
+import ssl
+import subprocess
 import threading
+import urllib.request
 import zipfile
 
 import h5py
@@ -41,7 +45,7 @@ class Server:
                 if how in ("404", "503"):
                     self.send_error(int(how))
                     return
-                if wanted and int(wanted[6:-1]) >= len(content):
+                if how == "416" or wanted and int(wanted[6:-1]) >= len(content):
                     self.send_error(416)
                     return
                 if wanted and how != "no ranges":
@@ -154,17 +158,43 @@ def test_the_first_download_is_trusted_and_later_ones_must_equal_it(server, tmp_
         fetch([server.url], path)
 
 
-def test_certificates_are_checked(tmp_path):
-    """An https address whose server speaks plain HTTP is a failure, not a fallback."""
-    server = Server()
-    with pytest.raises(CorrmatError, match="SSL|ssl"):
-        fetch([server.url.replace("http:", "https:")], tmp_path / "data.zip", timeout=2)
-    server.http.shutdown()
-    server.http.server_close()
+def test_a_server_that_always_says_that_nothing_is_left_is_named(server, tmp_path):
+    server.behave = ["416"] * 9
+    with pytest.raises(CorrmatError, match="HTTP 416"):
+        fetch([server.url], tmp_path / "data.zip")
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="no openssl at hand")
+def test_certificates_are_checked(server, tmp_path):
+    """A server that signs for itself serves the whole file, and gets no say."""
+    key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
+    words = [
+        "req",
+        "-x509",
+        "-newkey",
+        "rsa:2048",
+        "-nodes",
+        "-days",
+        "1",
+        "-subj",
+        "/CN=127.0.0.1",
+    ]
+    words += ["-addext", "subjectAltName=IP:127.0.0.1", "-keyout", key, "-out", certificate]
+    subprocess.run(["openssl", *words], check=True, capture_output=True)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(certificate, key)
+    server.http.socket = context.wrap_socket(server.http.socket, server_side=True)
+    url = server.url.replace("http:", "https:")
+    with pytest.raises(CorrmatError, match="CERTIFICATE_VERIFY_FAILED"):
+        fetch([url], tmp_path / "data.zip", timeout=5)
+    assert not (tmp_path / "data.zip").exists()
+    trusting = ssl.create_default_context(cafile=certificate)
+    with urllib.request.urlopen(url, timeout=5, context=trusting) as answer:
+        assert answer.read() == CONTENT  # it was the certificate, and nothing else
 
 
 def archive(path, members):
-    with zipfile.ZipFile(path, "w") as file:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
         for name, content in members.items():
             file.writestr(name, content)
     return path
@@ -186,9 +216,18 @@ def test_links_damage_and_other_archives_are_refused(tmp_path):
         file.writestr(link, "/etc/passwd")
     with pytest.raises(CorrmatError, match="is a link"):
         unzip(path, tmp_path, "set")
-    whole = archive(tmp_path / "b.zip", {"set/in.txt": "in" * 999}).read_bytes()
-    (tmp_path / "b.zip").write_bytes(whole.replace(b"inin", b"inout", 1))
-    with pytest.raises(CorrmatError, match="damaged|no whole zip"):
+    whole = archive(tmp_path / "b.zip", {"set/in.txt": CONTENT.hex()}).read_bytes()
+    for at in (60, 1000, len(whole) // 2, -30):  # of its member's packed bytes, of its directory
+        spoilt = bytearray(whole)
+        spoilt[at : at + 4] = bytes(255 - byte for byte in spoilt[at : at + 4])
+        (tmp_path / "b.zip").write_bytes(spoilt)
+        with pytest.raises(CorrmatError, match="damaged|no whole zip|leads out|does not hold"):
+            unzip(tmp_path / "b.zip", tmp_path, "set")
+    encrypted = bytearray(whole)
+    for start in (whole.find(b"PK\x03\x04") + 6, whole.rfind(b"PK\x01\x02") + 8):
+        encrypted[start] |= 1  # the flag; nobody has the key
+    (tmp_path / "b.zip").write_bytes(encrypted)
+    with pytest.raises(CorrmatError, match="no whole zip"):
         unzip(tmp_path / "b.zip", tmp_path, "set")
     (tmp_path / "c.zip").write_bytes(whole[:50])
     with pytest.raises(CorrmatError, match="no whole zip"):

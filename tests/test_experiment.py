@@ -17,6 +17,7 @@ from rich.console import Console
 
 from corrmat import console, experiment, page, recipe
 from corrmat.errors import CorrmatError
+from corrmat.metrics import rotation_error_deg
 from corrmat.module import RegistrationModule
 
 IDS = [path.stem for path in sorted((ROOT / "configs" / "exp").glob("*.yaml"))]
@@ -114,13 +115,21 @@ def test_per_pair_transforms_score_to_the_metrics_of_the_record(tmp_path):
     found = load("1.1")
     record = experiment.run(found, tmp_path / "results", tmp_path / "runs")
     rows = list(csv.DictReader((tmp_path / "results/smoke/shapes/1.1/per_pair.csv").open()))
+    pairs = experiment.make_datamodule(found.settings["DCP"]).test_dataloader().dataset
+    truth = pairs.__getitems__([(0, i) for i in range(len(pairs))])
     for arm, scores in record["arms"].items():
         own = [row for row in rows if row["arm"] == arm]
         mean = sum(float(row["rotation_error_deg"]) for row in own) / len(own)
         assert mean == pytest.approx(scores["rotation_error_deg_mean"], rel=1e-4)
         right, total = (sum(int(row[k]) for row in own) for k in ("right", "rows"))
         assert right / total == pytest.approx(scores["match_accuracy"])
-        assert all(len(row["transform"].split()) == 12 for row in own)
+        transform = torch.tensor([[float(v) for v in row["transform"].split()] for row in own])
+        error = rotation_error_deg(transform[:, :9].view(-1, 3, 3), truth.rotation)
+        stated = torch.tensor([float(row["rotation_error_deg"]) for row in own])
+        torch.testing.assert_close(error.float(), stated, rtol=1e-3, atol=1e-2)
+        off = (transform[:, 9:] - truth.translation).norm(dim=1)
+        stated = torch.tensor([float(row["translation_error"]) for row in own])
+        torch.testing.assert_close(off, stated, rtol=1e-3, atol=1e-4)
 
 
 def test_experiment_1_4_takes_the_networks_of_1_1(tmp_path, capsys):
@@ -258,10 +267,27 @@ def test_the_last_step_is_validated_wherever_it_falls(tmp_path):
 def test_nothing_is_deleted_or_trained_when_the_test_split_cannot_be_read(tmp_path):
     found = load("1.1")
     experiment.run(found, tmp_path / "results", tmp_path / "runs")
-    for bad in (["--data.test_shapes", "801"], ["--trainer.accelerator", "warp"], ["--seed", "-1"]):
+    best = tmp_path / "runs/smoke/shapes/1.1/DCP/best.ckpt"
+    before = best.stat().st_mtime_ns
+    for bad in (
+        ["--data.test_shapes", "801"],
+        ["--trainer.accelerator", "warp"],
+        ["--seed", "-1"],
+        ["--network.k", "0"],
+        ["--network.width", "-4"],
+        ["--trainer.max_steps", "-1", "--trainer.max_epochs", "-1"],
+        ["--trainer.accumulate_grad_batches", "3"],  # validated after 4 batches
+    ):
         with pytest.raises(CorrmatError):
             experiment.run(load("1.1", *bad), tmp_path / "results", tmp_path / "runs")
-    assert (tmp_path / "runs/smoke/shapes/1.1/DCP/best.ckpt").is_file()
+        assert best.stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize("option", ["iterations", "test_iterations"])
+def test_a_network_without_an_iteration_is_refused_before_training(option, tmp_path):
+    with pytest.raises(CorrmatError, match="no network of these"):
+        experiment.run(load("2.1", f"--network.{option}", "0"), tmp_path / "r", tmp_path / "runs")
+    assert not list(tmp_path.rglob("*.ckpt"))
 
 
 def test_a_loss_that_is_no_number_stops_the_run_and_leaves_no_record(tmp_path, monkeypatch):

@@ -11,6 +11,7 @@ from corrmat.losses import mutual_loss, mutual_matches
 from corrmat.methods import InvariantCorr
 from corrmat.networks.invariant import InvariantNetwork, radius, spread
 from corrmat.networks.ppf import SIGNLESS, signless_pair_features
+from corrmat.ops import streaming
 from corrmat.ops.correspondence import MatchabilityCorrespondence
 from corrmat.types import PairBatch, Prediction
 
@@ -130,6 +131,26 @@ def test_the_transposed_matrix_is_the_matrix_transposed(generator):
     torch.testing.assert_close(t.prob()[..., 5], 1 - m_y.sigmoid())
     alone = MatchabilityCorrespondence(f_y, f_x, 0.5, m_y, m_x)
     torch.testing.assert_close(t.logits(), alone.logits())
+
+
+def test_the_streamed_matchability_is_the_whole_ones(generator, monkeypatch):
+    f_x, f_y, m_x, m_y, y = (
+        torch.randn(2, *s, generator=generator, dtype=torch.float64)
+        for s in ((5, 4), (7, 4), (5,), (7,), (7, 3))
+    )
+    index = torch.tensor([[0, 6, 7, -1, 3], [1, 2, 7, 7, 0]])
+    found = []
+    for most in (2**23, 0):
+        monkeypatch.setattr(streaming, "_DENSE", most)
+        monkeypatch.setattr(streaming, "_SLICE", 20)
+        inputs = [f_x.clone(), f_y.clone(), m_x.clone(), m_y.clone()]
+        a, b, c, d = (value.requires_grad_() for value in inputs)
+        matrix = MatchabilityCorrespondence(a, b, 0.5, c, d)
+        values = matrix.nll(index), matrix.soft_target(y), matrix.weight()
+        grads = torch.autograd.grad(sum(v.square().sum() for v in values), inputs)
+        found.append([*values, *grads])
+    for whole, streamed in zip(*found, strict=True):
+        torch.testing.assert_close(whole, streamed)
 
 
 def test_a_perfect_prediction_costs_next_to_nothing(generator):

@@ -120,6 +120,10 @@ def test_a_record_whose_code_has_changed_is_marked(tmp_path):
     assert page.staleness(found, tmp_path) == ""
     code.write_text("a = 2\n")
     assert page.staleness(found, tmp_path) == "changed since: losses.py"
+    code.write_text("a = 1\n")
+    (code.parent / "methods.py").write_text("b = 1\n")
+    git("add", "-A")
+    assert page.staleness(found, tmp_path) == "changed since: methods.py"
     arms["DCP"]["trained_at"] += "+"
     assert page.staleness(found, tmp_path) == "trained with uncommitted code"
 

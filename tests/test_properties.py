@@ -188,7 +188,7 @@ def _file(kind):
     if kind in (".npy", ".npz"):
         (np.save if kind == ".npy" else np.savez)(made, points)
         return made.getvalue()
-    if kind in (".xyz", ".csv"):
+    if kind in (".xyz", ".csv", ".txt"):
         return "\n".join(" ".join(map(str, row)) for row in points).encode()
     if kind == ".pcd":
         head = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 12\nHEIGHT 1\n"
@@ -197,10 +197,15 @@ def _file(kind):
     if kind == ".ply":
         return trimesh.PointCloud(points).export(file_type="ply")
     content = trimesh.creation.box().export(file_type=kind[1:])
+    if isinstance(content, dict):  # without the files that a .gltf names
+        content = content["model.gltf"]
     return content.encode() if isinstance(content, str) else content
 
 
-KINDS = (".ply", ".stl", ".off", ".obj", ".glb", ".pcd", ".xyz", ".csv", ".npy", ".npz")
+KINDS = (
+    ".ply", ".stl", ".off", ".obj", ".glb", ".gltf",
+    ".pcd", ".xyz", ".txt", ".csv", ".npy", ".npz",
+)  # fmt: skip
 WHOLE = {kind: _file(kind) for kind in KINDS}
 
 

@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -198,6 +199,7 @@ def test_the_command_writes_what_it_promises(pair, tmp_path, capsys):
         (["a.ply", "a.ply", "--html", "none/b.html"], "no folder none"),
         (["a.ply", "a.ply", "--model", "none.pth"], "no model 'none.pth'"),
         (["a.ply", "a.ply", "--model", "a.ply"], "a.ply is no checkpoint"),
+        (["a.ply", "a.ply", "--model", "a.stl"], "a.stl is no checkpoint"),
         (["a.ply", "two.xyz"], "target: 2 points"),
     ],
 )
@@ -205,6 +207,7 @@ def test_bad_input_is_one_line_and_code_2(words, message, tmp_path, monkeypatch,
     monkeypatch.chdir(tmp_path)
     write_ply(tmp_path / "a.ply", GRID)
     (tmp_path / "two.xyz").write_text("0 0 0\n1 1 1\n")
+    (tmp_path / "a.stl").write_text("solid a\nendsolid a\n")
     assert main(["register", *words]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
@@ -223,6 +226,16 @@ def test_a_checkpoint_that_could_run_code_is_refused(tmp_path):
     with pytest.raises(CorrmatError, match="no checkpoint of tensors alone"):
         load_model(path)
     assert not (tmp_path / "sprung").exists()
+
+
+def test_a_model_trained_anew_is_read_anew(tmp_path, monkeypatch):
+    monkeypatch.setattr(registration, "load_model", lambda model: Path(model).read_text())
+    monkeypatch.setattr(registration, "Learned", lambda content: content)
+    path = tmp_path / "best.ckpt"
+    path.write_text("first")
+    assert registration._learned(str(path)) is registration._learned(str(path))
+    path.write_text("second training")
+    assert registration._learned(str(path)) == "second training"
 
 
 def test_a_checkpoint_of_another_network_names_what_does_not_fit(tmp_path):
@@ -281,5 +294,5 @@ def test_the_page_opens_in_a_browser(pair, tmp_path):
     words += ["--enable-logging=stderr", "--dump-dom", path.as_uri()]
     shown = subprocess.run([BROWSER, *words], capture_output=True, text=True, timeout=120)
     assert "before, and the matches" in shown.stdout
-    assert "CONSOLE" not in "".join(line for line in shown.stderr if "Uncaught" in line)
+    assert not [line for line in shown.stderr.splitlines() if "Uncaught" in line]
     assert 'class="gl-container"' in shown.stdout

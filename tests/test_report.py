@@ -62,6 +62,34 @@ def test_the_figure_is_drawn_the_same_twice(tmp_path):
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
+def test_panels_show_training_bands_or_the_sweep():
+    shown = figures.panels(RECORD)
+    assert [panel.title for panel in shown][:2] == ["training loss", "correct matches, %"]
+    assert {panel.across for panel in shown} == {"training pairs seen"}
+    matches = [(c.arm, c.paper, c.y) for c in shown[1].curves]
+    assert matches == [
+        ("DCP", False, [10]), ("DCP", True, [5.5, 5.5]),
+        ("DCP_corr", False, [10]), ("DCP_corr", True, [99.9, 99.9]),
+    ]  # fmt: skip
+
+    parts = [{"match_accuracy": 0.5, "relative_euler_mae_deg": 2.0, "relative_euler_rmse_deg": 3.0}]
+    bands = {"bands": [{"band_deg": [0, 30]} | parts[0]]}
+    arms = {arm: found | bands for arm, found in RECORD["arms"].items()}
+    shown = figures.panels(RECORD | {"arms": arms, "paper": {"DCP": bands}})
+    assert [panel.title for panel in shown][1] == "rotation MAE (Euler), deg"
+    assert [(c.arm, c.paper, c.x, c.y) for c in shown[1].curves] == [
+        ("DCP", False, [15], [2.0]), ("DCP", True, [15], [2.0]), ("DCP_corr", False, [15], [2.0]),
+    ]  # fmt: skip
+
+    sweep = {"sweep": [{"outliers": 0.4} | parts[0]]}
+    arms = {arm: found | sweep for arm, found in RECORD["arms"].items()}
+    shown = figures.panels(RECORD | {"arms": arms})
+    assert [panel.across for panel in shown][3:] == ["training pairs seen"] + [
+        "outliers in the test, %"
+    ] * 2
+    assert shown[-1].curves[0][2:4] == ([40], [3.0])
+
+
 @pytest.mark.parametrize(
     ("page", "name", "make"),
     [

@@ -36,10 +36,13 @@ def test_every_cloud_format_gives_its_points(tmp_path, kind):
     assert np.abs(found - POINTS).max() < (1e-4 if kind == ".pcd" else 1e-12)
 
 
-@pytest.mark.parametrize("kind", [k for k in MESHES if k != ".gltf"])
+@pytest.mark.parametrize("kind", MESHES)
 def test_a_mesh_is_sampled_evenly_and_by_seed(tmp_path, kind):
     path = tmp_path / f"box{kind}"
-    trimesh.creation.box((2, 2, 2)).export(path)
+    made = trimesh.creation.box((2, 2, 2)).export(file_type=kind[1:])
+    for name, content in made.items() if kind == ".gltf" else [(path.name, made)]:
+        name = path.name if name == "model.gltf" else name
+        (tmp_path / name).write_bytes(content.encode() if isinstance(content, str) else content)
     found = read_scan(path, seed=1)
     assert found.shape == (20_000, 3)
     assert np.allclose(np.abs(found).max(1), 1, atol=1e-6)  # all on the surface
@@ -103,6 +106,12 @@ def test_a_file_cut_short_is_an_error_not_fewer_points(tmp_path, kind):
     path.write_bytes(whole[: int(0.7 * len(whole))])
     with pytest.raises(CorrmatError, match=f"cannot be read as {kind[1:].upper()}"):
         read_scan(path)
+
+
+def test_an_array_of_words_is_not_points(tmp_path):
+    np.save(tmp_path / "words.npy", np.full((4, 3), "abc"))
+    with pytest.raises(CorrmatError, match="cannot be read as NPY"):
+        read_scan(tmp_path / "words.npy")
 
 
 def test_arrays_that_could_run_code_are_refused(tmp_path):

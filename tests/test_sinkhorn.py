@@ -3,6 +3,7 @@ import torch
 from twins import sinkhorn_padded
 
 from corrmat.losses import correspondence_loss
+from corrmat.ops import streaming
 from corrmat.ops.correspondence import SinkhornCorrespondence
 from corrmat.ops.sinkhorn import sinkhorn_potentials
 
@@ -18,9 +19,15 @@ def affinity(generator):
     return 3 * torch.randn(2, 6, 8, generator=generator, dtype=torch.float64)
 
 
+@pytest.mark.parametrize("whole", [True, False])
 @pytest.mark.parametrize("slack", ["row", "both", "none"])
 @pytest.mark.parametrize("iterations", [0, 1, 5])
-def test_potentials_equal_the_padded_matrix_in_value_and_gradient(slack, iterations, generator):
+def test_potentials_equal_the_padded_matrix_in_value_and_gradient(
+    slack, iterations, whole, generator, monkeypatch
+):
+    if not whole:
+        monkeypatch.setattr(streaming, "_DENSE", 0)
+        monkeypatch.setattr(streaming, "_SLICE", 20)
     a = affinity(generator).requires_grad_()
     pull = torch.randn(a.shape, generator=generator, dtype=torch.float64)
     fast, naive = sinkhorn(a, iterations, slack), sinkhorn_padded(a, iterations, slack)

@@ -157,7 +157,7 @@ class SaveOnInterrupt(Callback):
         self, trainer: L.Trainer, pl_module: L.LightningModule, batch: PairBatch, batch_idx: int
     ) -> None:
         """Stop here, before the step has touched anything."""
-        if self.noted:
+        if self.noted and batch_idx % trainer.accumulate_grad_batches == 0:
             raise KeyboardInterrupt
 
     def on_exception(

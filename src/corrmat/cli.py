@@ -169,7 +169,9 @@ def parser() -> argparse.ArgumentParser:
         "results", type=Path, nargs="?", default=Path("results"), help="folder of records"
     )
     report.add_argument("-o", "--output", type=Path, help="write all records as one HTML page")
-    report.add_argument("--docs", type=Path, help="folder of README.md and docs/: rewrite tables")
+    report.add_argument(
+        "--docs", type=Path, help="folder of README.md and docs/: rewrite tables, redraw pictures"
+    )
     completion = commands.add_parser("completion", help="print what makes a shell complete words")
     completion.add_argument("shell", choices=["bash", "zsh", "tcsh"])
     return found
@@ -470,7 +472,11 @@ def _report(results: Path, output: Path | None, docs: Path | None) -> int:
         output.write_text(content)
         print(f"{output}: {len(content) / 1e6:.1f} MB, open it in a browser")
     if docs is not None:
+        from corrmat import record
+
         records = report.read_records(results, scale="laptop")
+        for found in records:
+            record.draw(results / found["scale"] / found["data"] / found["id"])
         pages = docs / "README.md", docs / "docs" / "reproduction.md"
         report.refresh(pages[0], "results", report.markdown_summary(records))
         report.refresh(pages[0], "register", report.markdown_register(results))

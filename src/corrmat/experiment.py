@@ -27,7 +27,7 @@ from corrmat import logs, record, report
 from corrmat.baselines import BASELINES, UNTRAINED
 from corrmat.callbacks import Curve, SaveOnInterrupt, WholeCheckpoints, say
 from corrmat.console import Board, Progress
-from corrmat.data.datamodule import RegistrationDataModule
+from corrmat.data.datamodule import PairDataset, RegistrationDataModule
 from corrmat.errors import CorrmatError
 from corrmat.files import ensure_writable, replace_text
 from corrmat.losses import CorrespondenceLoss
@@ -71,14 +71,44 @@ def prepare(name: str, settings: Settings) -> Arm:
     if not 0 <= settings.seed < 2**32:
         raise CorrmatError(f"seed {settings.seed} is not between 0 and 2^32")
     arm = Arm(name, settings, make_datamodule(settings))
-    make_module(settings)
+    module = make_module(settings)
     arm.datamodule.setup()
+    _refuse_schedules(settings)
+    _try(module, arm)
     try:
         L.Trainer(**trainer_options(settings), logger=False)
     except (MisconfigurationException, ValueError, TypeError) as error:
         first = str(error).splitlines()[0]
         raise CorrmatError(f"no Trainer of these --trainer options: {first}") from error
     return arm
+
+
+def _refuse_schedules(settings: Settings) -> None:
+    trainer = settings.trainer
+    endless = trainer.max_epochs == -1 and trainer.max_steps == -1
+    if endless and settings.optimizer.schedule == "onecycle":
+        raise CorrmatError("a one-cycle learning rate needs --trainer.max_steps or max_epochs")
+    interval, together = trainer.val_check_interval, trainer.accumulate_grad_batches
+    if isinstance(interval, int) and interval % together:
+        raise CorrmatError(
+            f"--trainer.val_check_interval {interval} is no multiple of accumulate_grad_batches "
+            f"{together}: a checkpoint would fall into the middle of a step"
+        )
+
+
+@torch.no_grad()
+def _try(module: RegistrationModule, arm: Arm) -> None:
+    """One pair through a network, as in training and as in a test."""
+    dataset = arm.datamodule.test_dataloader().dataset
+    assert isinstance(dataset, PairDataset)
+    pair = dataset.__getitems__([(0, 0)] * 2)
+    try:
+        for training in (True, False):
+            module.train(training)
+            module.loss(module(pair.source, pair.target), pair)
+    except (RuntimeError, ValueError, ArithmeticError, LookupError) as error:
+        said = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise CorrmatError(f"no network of these --network options: {said}") from error
 
 
 def run(
@@ -318,7 +348,7 @@ def make_module(settings: Settings) -> RegistrationModule:
     method = METHODS[settings.method]
     try:
         network: Any = method.network_type(**settings.network.as_dict())
-    except ValueError as error:
+    except (ValueError, RuntimeError, ArithmeticError) as error:
         raise CorrmatError(f"no network of these --network options: {error}") from error
     points = make_datamodule(settings).how.num_source
     if points < network.min_points:

@@ -1,11 +1,12 @@
 """Figures of a record: the paper's curves, and what was matched with what."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from corrmat.report import METRICS, family, value_of
 
@@ -15,42 +16,110 @@ PANELS = {
     "RPMNet": ("loss", "match_accuracy", "rotation_error_deg_mean", "chamfer"),
     "PCRNet": ("loss", "match_accuracy", "naive_euler_rmse_deg", "rotation_error_deg_mean"),
 }
+OF_BANDS = ("match_accuracy", "relative_euler_mae_deg", "chamfer")
+OF_SWEEP = ("match_accuracy", "relative_euler_rmse_deg")
 COLOURS = ("#d62728", "#1f77b4", "#2ca02c", "#9467bd")  # METHOD red, METHOD_corr blue: the paper's
 LINES = 150  # matches drawn, at most
 
 
-def panels_of(record: Mapping[str, Any]) -> tuple[str, ...]:
-    """What the curves of a record show: the paper's columns, or those of a network of one's own."""
+class Curve(NamedTuple):
+    """An arm's values, or those that the paper gives for it."""
+
+    arm: str
+    colour: str
+    x: list[float]
+    y: list[float]
+    paper: bool = False
+
+
+class Panel(NamedTuple):
+    """One pair of axes."""
+
+    title: str
+    across: str  # what x counts
+    log_x: bool
+    log_y: bool
+    curves: list[Curve]
+
+
+def panels(record: Mapping[str, Any]) -> list[Panel]:
+    """What the curves of a record show.
+
+    Validation in training, against pairs seen, in the paper's columns (`PANELS`); for a test in
+    bands of initial misalignment (1.4 and 2.4) what it found in each instead; and what other
+    shares of outliers than the trained one do, where they were tested.
+    """
+    first = next(iter(record["arms"].values()))
+    if first.get("bands"):
+        return [_against(record, name, "bands") for name in OF_BANDS]
     own = ("loss", "match_accuracy", "rotation_error_deg_mean", "translation_rmse")
-    return PANELS.get(family(record), own)
+    found = [_training(record, name) for name in PANELS.get(family(record), own)]
+    return found + [_against(record, name, "sweep") for name in OF_SWEEP if first.get("sweep")]
+
+
+def _training(record: Mapping[str, Any], name: str) -> Panel:
+    title, _, factor = METRICS.get(name, ("training loss", "", 1))
+    curves = []
+    most = [1]
+    for arm, colour, found in _arms(record):
+        seen = [point["pairs_seen"] for point in found["curve"]]
+        most.append(max(seen, default=1))
+        values = [value_of(point, name) for point in found["curve"]]
+        if seen and None not in values:
+            curves.append(Curve(arm, colour, seen, [factor * v for v in values if v is not None]))
+        final = value_of(record["paper"].get(arm, {}), name)
+        if seen and final is not None:
+            curves.append(Curve(arm, colour, [seen[0], seen[-1]], [factor * final] * 2, paper=True))
+    apart = max(most) > 4 * min(most[1:], default=1)  # PCRNet's arms share minutes, not pairs
+    log_y = name not in ("loss", "match_accuracy")
+    return Panel(title, "training pairs seen", apart, log_y, curves)
+
+
+def _against(record: Mapping[str, Any], name: str, part: str) -> Panel:
+    title, _, factor = METRICS[name]
+    curves = []
+    for arm, colour, found in _arms(record):
+        for group, paper in ((found, False), (record["paper"].get(arm, {}), True)):
+            points = [(_place(p), value_of(p, name)) for p in group.get(part, [])]
+            known = [(x, factor * y) for x, y in points if y is not None]
+            if known:
+                x, y = map(list, zip(*known, strict=True))
+                curves.append(Curve(arm, colour, x, y, paper))
+    across = "initial misalignment, deg" if part == "bands" else "outliers in the test, %"
+    return Panel(title, across, False, name != "match_accuracy", curves)
+
+
+def _place(part: Mapping[str, Any]) -> float:
+    return sum(part["band_deg"]) / 2 if "band_deg" in part else 100 * part["outliers"]
+
+
+def _arms(record: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+    for (arm, found), colour in zip(record["arms"].items(), COLOURS, strict=False):
+        yield arm, colour, found
+
+
+def grid(number: int) -> tuple[int, int]:
+    """Rows and columns for so many panels."""
+    rows = -(-number // 4)
+    return rows, -(-number // rows)
 
 
 def curves_figure(record: Mapping[str, Any], path: Path) -> None:
-    """The paper's columns (`PANELS`), all arms.
-
-    Validation metrics against pairs seen; the paper's final values as dotted lines.
-    """
-    arms = record["arms"]
-    panels = panels_of(record)
-    figure = Figure(figsize=(15, 3.6), layout="constrained")
+    """`panels` of a record as a PNG; what the paper gives is dotted."""
+    shown = panels(record)
+    rows, columns = grid(len(shown))
+    figure = Figure(figsize=(3.75 * columns, 3.6 * rows), layout="constrained")
     figure.suptitle(f"{record['id']}  {record['title']}  ({record['scale']}, {record['data']})")
-    for axes, name in zip(figure.subplots(1, len(panels)), panels, strict=True):
-        title, _, factor = METRICS.get(name, ("training loss", "", 1))
-        for arm, colour in zip(arms, COLOURS, strict=False):
-            curve = arms[arm]["curve"]
-            values = [value_of(point, name) for point in curve]
-            if None not in values:
-                seen = [point["pairs_seen"] for point in curve]
-                shown = [factor * value for value in values if value is not None]
-                axes.plot(seen, shown, color=colour, marker=".", label=arm)
-            final = value_of(record["paper"].get(arm, {}), name)
-            if final is not None:
-                axes.axhline(
-                    factor * final, color=colour, linestyle=":", linewidth=1, label=f"paper, {arm}"
-                )
-        if name not in ("loss", "match_accuracy"):
-            axes.set_yscale("log")
-        axes.set(title=title, xlabel="training pairs seen")
+    for axes, panel in zip(figure.subplots(rows, columns).flat, shown, strict=True):
+        for curve in panel.curves:
+            style = {"linestyle": ":", "linewidth": 1} if curve.paper else {"marker": "."}
+            label = f"paper, {curve.arm}" if curve.paper else curve.arm
+            axes.plot(curve.x, curve.y, color=curve.colour, label=label, **style)
+        if panel.log_x:
+            axes.set_xscale("log")
+            axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.set_yscale("log" if panel.log_y else "linear")
+        axes.set(title=panel.title, xlabel=panel.across)
         axes.grid(alpha=0.3)
         axes.legend(fontsize="x-small")
     figure.savefig(path, dpi=110, metadata={"Software": None})
@@ -71,29 +140,44 @@ def matches_figure(view: Mapping[str, Any], title: str, path: Path) -> None:
     called = np.asarray(last["matched"])
     aligned = x @ np.asarray(last["rotation"]).T + last["translation"]
     outlier, right = called == len(y), called == match
-    # The target is set aside, so that lines do not hide in the clouds.
-    aside = np.array([0.6 * (np.ptp(x, 0).max() + np.ptp(y, 0).max()), 0, 0])
-    figure = Figure(figsize=(11, 5), layout="constrained")
     inlier = (match >= 0) & (match < len(y))
+    x, y, aligned = map(_seen, (x, y, aligned))
+    # The target is set aside, so that lines do not hide in the clouds.
+    aside = y - [y[:, 0].min() - x[:, 0].max() - 0.3 * np.ptp(y[:, 0]), 0]
+    wide = [box[0] / box[1] for box in (_box(x, aside), _box(aligned, y))]
+    height = min(1 + 10 / sum(wide), 6)
+    figure = Figure(figsize=(10, height), layout="constrained")
     figure.suptitle(f"{title}: {100 * right[inlier].mean():.0f} % of the matches are right")
-    for place, (source, target, heading) in enumerate(
-        ((x, y + aside, "source, target set aside, matches"), (aligned, y, "registered"))
+    both = figure.subplots(1, 2, width_ratios=wide)
+    for axes, source, target, heading in (
+        (both[0], x, aside, "source, target set aside, matches"),
+        (both[1], aligned, y, "registered"),
     ):
-        axes: Any = figure.add_subplot(1, 2, place + 1, projection="3d")
-        axes.scatter(*target.T, s=6, color="#1f77b4", label="target")
-        axes.scatter(*source.T, s=6, color="black", label="source")
+        for i in np.flatnonzero(~outlier)[:LINES]:
+            colour = "#2ca02c" if right[i] else "#d62728"
+            ends = np.stack([source[i], target[called[i]]])
+            axes.plot(*ends.T, color=colour, lw=0.5, alpha=0.6, zorder=1)
+        axes.scatter(*target.T, s=22, color="#9ecae9", linewidths=0, label="target")
+        axes.scatter(*source.T, s=4, color="black", linewidths=0, label="source")
         if outlier.any():
             rings = np.where(right[outlier], "#2ca02c", "#d62728")
             axes.scatter(
                 *source[outlier].T, s=60, facecolors="none", edgecolors=rings,
                 label="called outlier",
             )  # fmt: skip
-        for i in np.flatnonzero(~outlier)[:LINES]:
-            colour = "#2ca02c" if right[i] else "#d62728"
-            axes.plot(*np.stack([source[i], target[called[i]]]).T, color=colour, lw=0.5, alpha=0.6)
-        axes.set(title=heading)
-        axes.set_box_aspect(np.ptp(np.concatenate([source, target]), 0), zoom=1.2)
-        axes.view_init(elev=20, azim=-80)
+        axes.set(title=heading, aspect="equal")
         axes.set_axis_off()
-        axes.legend(fontsize="x-small", loc="lower left")
+    both[1].legend(fontsize="x-small", loc="best")
     figure.savefig(path, dpi=110, metadata={"Software": None})
+
+
+def _seen(points: np.ndarray) -> np.ndarray:
+    """Points (N, 3) as the eye sees them from a little aside and above: (N, 2), no perspective."""
+    turn, up = np.radians((10, 20))
+    right = [np.cos(turn), np.sin(turn), 0]
+    over = [np.sin(up) * np.sin(turn), -np.sin(up) * np.cos(turn), np.cos(up)]
+    return points @ np.array([right, over]).T
+
+
+def _box(*clouds: np.ndarray) -> Sequence[float]:
+    return np.ptp(np.concatenate(clouds), 0).clip(1e-3)

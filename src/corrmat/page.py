@@ -15,7 +15,7 @@ import numpy as np
 from plotly.offline import get_plotlyjs
 
 from corrmat import report
-from corrmat.figures import COLOURS, panels_of
+from corrmat.figures import COLOURS, grid, panels
 
 GREEN, RED, BLUE = "#2ca02c", "#d62728", "#1f77b4"
 # What a family's numbers depend on, below src/corrmat; the recipes come on top.
@@ -23,7 +23,7 @@ CODE = (
     "ops/rigid.py", "ops/correspondence.py", "ops/streaming.py",
     "ops/neighbors.py", "data/pairs.py", "data/datamodule.py", "data/clouds.py",
     "data/normals.py", "data/modelnet40.py", "data/shapes.py", "data/families.py",
-    "data/solids.py", "losses.py", "module.py", "metrics.py", "baselines.py",
+    "data/solids.py", "losses.py", "methods.py", "module.py", "metrics.py", "baselines.py",
 )  # fmt: skip
 FAMILY_CODE = {
     "DCP": (
@@ -188,40 +188,29 @@ def _provenance(record: Mapping[str, Any], source: str) -> str:
 
 
 def _curves(record: Mapping[str, Any]) -> dict[str, Any]:
-    panels = panels_of(record)
+    shown = panels(record)
+    rows, columns = grid(len(shown))
     data: list[dict[str, Any]] = []
     layout: dict[str, Any] = {
-        "grid": {"rows": 1, "columns": len(panels), "pattern": "independent"},
+        "grid": {"rows": rows, "columns": columns, "pattern": "independent"},
         "margin": {"t": 40, "r": 10},
-        "legend": {"orientation": "h", "y": -0.25},
+        "legend": {"orientation": "h", "y": -0.25 / rows},
+        "height": 330 * rows,
     }
-    for i, name in enumerate(panels):
+    for i, panel in enumerate(shown):
         suffix = "" if i == 0 else str(i + 1)
-        title, _, factor = report.METRICS.get(name, ("training loss", "", 1))
-        for arm, colour in zip(record["arms"], COLOURS, strict=False):
-            curve = record["arms"][arm]["curve"]
-            seen = [point["pairs_seen"] for point in curve]
-            values = [report.value_of(point, name) for point in curve]
-            style = {"color": colour}
-            common = {
-                "xaxis": f"x{suffix}",
-                "yaxis": f"y{suffix}",
-                "legendgroup": arm,
-                "line": style,
-            }
-            if None not in values:
-                shown = [factor * value for value in values if value is not None]
-                data.append(
-                    common | {"x": seen, "y": shown, "name": arm, "showlegend": name == panels[0]}
-                )
-            final = report.value_of(record["paper"].get(arm, {}), name)
-            if final is not None and seen:
-                dotted = {"line": style | {"dash": "dot"}, "mode": "lines", "showlegend": False}
-                ends = {"x": [0, seen[-1]], "y": [factor * final] * 2, "name": f"paper, {arm}"}
-                data.append(common | dotted | ends)
-        kind = "linear" if name in ("loss", "match_accuracy") else "log"
-        layout[f"xaxis{suffix}"] = {"title": {"text": "pairs seen"}}
-        layout[f"yaxis{suffix}"] = {"type": kind, "title": {"text": title, "standoff": 4}}
+        for curve in panel.curves:
+            new = all(known.get("name") != curve.arm for known in data)
+            own: dict[str, Any] = {"name": curve.arm, "showlegend": new}
+            dotted = {"name": f"paper, {curve.arm}", "mode": "lines", "showlegend": False}
+            line = {"color": curve.colour} | ({"dash": "dot"} if curve.paper else {})
+            place = {"xaxis": f"x{suffix}", "yaxis": f"y{suffix}", "legendgroup": curve.arm}
+            values = {"x": curve.x, "y": curve.y, "line": line}
+            data.append(place | values | (dotted if curve.paper else own))
+        kinds = ("log" if log else "linear" for log in (panel.log_x, panel.log_y))
+        for axis, kind, text in zip("xy", kinds, (panel.across, panel.title), strict=True):
+            title = {"text": text, "standoff": 4}
+            layout[f"{axis}axis{suffix}"] = {"type": kind, "title": title}
     return {"data": data, "layout": layout}
 
 

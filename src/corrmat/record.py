@@ -52,6 +52,8 @@ def scores(
 def rows(arm: str, tests: list[dict[str, Tensor]]) -> list[dict[str, Any]]:
     """Lines of per_pair.csv: the predicted transform of each pair and what it scores.
 
+    A transform is twelve numbers: the rotation row by row, then the translation.
+
     Args:
         arm: name of the arm or baseline.
         tests: per-pair values, one set a band.
@@ -143,12 +145,10 @@ def write(
         own["data"].pop("root")  # where the data lies is nobody else's business
     config = {"id": recipe.id, "scale": recipe.scale, "arms": settings}
     (partial / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
-    figures.curves_figure(record, partial / "curves.png")
     if views:
         (partial / "views.json").write_text(json.dumps(views) + "\n")
-        middle = views[len(views) // 2]
-        figures.matches_figure(middle, _title(record, middle), partial / "matches.png")
     (partial / "metrics.json").write_text(json.dumps(_finite(record), indent=1) + "\n")
+    draw(partial)
     folder.mkdir(parents=True, exist_ok=True)
     for name in FILES:
         if (partial / name).exists():
@@ -156,6 +156,16 @@ def write(
         else:  # of a network without matches
             (folder / name).unlink(missing_ok=True)
     partial.rmdir()
+
+
+def draw(folder: Path) -> None:
+    """Draw curves.png and matches.png of the record in a folder."""
+    record = json.loads((folder / "metrics.json").read_text())
+    figures.curves_figure(record, folder / "curves.png")
+    if (folder / "views.json").is_file():
+        views = json.loads((folder / "views.json").read_text())
+        middle = views[len(views) // 2]
+        figures.matches_figure(middle, _title(record, middle), folder / "matches.png")
 
 
 def _title(record: dict[str, Any], view: dict[str, Any]) -> str:

@@ -260,8 +260,15 @@ def calibration() -> dict[str, list[float]]:
     return json.loads(shipped_about()["calibration"])
 
 
-@functools.lru_cache(maxsize=4)
 def _learned(model: str) -> Learned:
+    """A model, kept in memory for as long as its file stays the same."""
+    path = Path(model)
+    known = path.stat() if path.is_file() else None
+    return _loaded(model, known and (str(path.resolve()), known.st_mtime_ns, known.st_size))
+
+
+@functools.lru_cache(maxsize=4)
+def _loaded(model: str, file: tuple[str, int, int] | None) -> Learned:
     return Learned(load_model(model))
 
 

@@ -135,7 +135,8 @@ def _tensors(path: Path) -> State:
         raise CorrmatError(
             f"{path} is no checkpoint of tensors alone; nothing else is ever loaded"
         ) from error
-    except (RuntimeError, EOFError, OSError, ValueError, KeyError) as error:
+    # Unpicklers fail in every way there is on a file that is none of theirs.
+    except Exception as error:
         raise CorrmatError(f"{path} is no checkpoint, or cut short") from error
     for key in ("state_dict", "model", "model_state_dict"):
         if isinstance(found, Mapping) and isinstance(found.get(key), Mapping):

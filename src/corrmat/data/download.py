@@ -8,6 +8,7 @@ import stat
 import urllib.error
 import urllib.request
 import zipfile
+import zlib
 from collections.abc import Sequence
 from http.client import HTTPException, HTTPResponse
 from pathlib import Path
@@ -66,11 +67,10 @@ def fetch(
                     replace_text(trusted, f"{digest}  {path.name}\n")
                 return
             except urllib.error.HTTPError as error:
-                if error.code == 416:  # nothing is left to send: what is here is not its file
-                    _drop(path)
-                    continue
                 failures.append(f"{mirror}: HTTP {error.code} {error.reason}")
-                break
+                if error.code != 416:
+                    break
+                _drop(path)  # nothing is left to send: what is here is not its file
             except CorrmatError as error:
                 failures.append(f"{mirror}: {error}")
                 break
@@ -103,7 +103,8 @@ def unzip(archive: Path, folder: Path, name: str) -> None:
         if not (aside / name).is_dir():
             raise CorrmatError(f"{archive} does not hold the folder {name}")
         (aside / name).replace(folder / name)
-    except zipfile.BadZipFile as error:
+    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
+        # Of a damaged, encrypted or unknown compression, in the words of as many libraries.
         raise CorrmatError(f"{archive} is no whole zip file; {_again(archive)}") from error
     finally:
         shutil.rmtree(aside, ignore_errors=True)

@@ -38,6 +38,8 @@ def read_scan(path: Path, seed: int = 0) -> np.ndarray:
     reader = reader or (_scene if kind in MESHES else _text)
     try:
         points = reader(path, seed)
+        if points.ndim == 2 and points.shape[1] >= 3:
+            points = np.ascontiguousarray(points[:, :3], np.float64)
     except CorrmatError:
         raise
     # Readers of damaged files fail in every way there is; each means the same to the user.
@@ -48,7 +50,7 @@ def read_scan(path: Path, seed: int = 0) -> np.ndarray:
         raise CorrmatError(f"{path} holds an array of shape {points.shape}, not points (N, 3)")
     if not len(points):
         raise CorrmatError(f"{path} holds no points")
-    return np.ascontiguousarray(points[:, :3], np.float64)
+    return points
 
 
 def write_ply(path: Path, points: np.ndarray) -> None:
