@@ -2,10 +2,11 @@
 
     make bench        a table on the screen, results/bench/bench.json and results/bench/growth.png
 
-Times are medians after a warm-up; memory is the peak of a process of its own above what it held
-before its first step. A ratio says how many times longer the naive twin takes, in the same process,
-turn by turn, so that it holds on a noisy machine. The twins are in tests/twins.py: the same values
-in the released formulation (NCHW edges, whole matrices, an SVD a pair, target features anew).
+Times are medians after a warm-up (of clouds above 4096 points: the first step's); memory is the
+peak of a process of its own above what it held before its first step. A ratio says how many times
+longer the naive twin takes, in the same process, turn by turn, so that it holds on a noisy machine.
+The twins are in tests/twins.py: the same values in the released formulation (NCHW edges, whole
+matrices, an SVD a pair, target features anew).
 """
 
 import contextlib
@@ -38,6 +39,8 @@ from corrmat.errors import CorrmatError  # noqa: E402
 from corrmat.experiment import keep_freed_memory  # noqa: E402
 from corrmat.losses import chamfer_loss, correspondence_loss  # noqa: E402
 from corrmat.methods import METHODS  # noqa: E402
+from corrmat.networks.dcp import DCPNetwork  # noqa: E402
+from corrmat.networks.rpmnet import RPMNetwork  # noqa: E402
 from corrmat.ops import streaming  # noqa: E402
 from corrmat.ops.correspondence import SinkhornCorrespondence, SoftCorrespondence  # noqa: E402
 from corrmat.ops.neighbors import within_radius  # noqa: E402
@@ -59,7 +62,7 @@ STEPS: tuple[tuple[str, dict[str, Any], int, int], ...] = (
     ("PCRNet", {}, 100, 8),
 )
 POINTS = (256, 512, 1024, 2048, 4096, 8192, 16384)
-GROWTH = {"DCP_corr, a step": POINTS, "RPMNet_corr, a step": POINTS[:5], "loss and pose": POINTS}
+GROWTH = {"DCP_corr, a step": POINTS, "RPMNet_corr, a step": POINTS[:6], "loss and pose": POINTS}
 
 
 def main() -> None:
@@ -76,10 +79,13 @@ def main() -> None:
     add("pairs, N=512, one core", in_a_process(pairs_a_second))
     for method, hparams, n, batch in STEPS:
         size = "laptop network" if hparams else "paper's network"
-        row = in_a_process(training_step, method, hparams, n, batch)
+        what = method, hparams, n, batch
+        row = in_a_process(training_step, *what)
         row["peak_share"] = round(row.pop("gflop_a_pair") / row["ms_a_pair"] * 1e3 / peak, 2)
-        if method in ("DCP_corr", "RPMNet_corr"):
-            row |= in_a_process(against_released, method, hparams, n, batch)
+        row["peak_mb"] = in_a_process(peak_of_a_step, *what, loss_of)
+        if METHODS[method].network_type in RELEASED:
+            row |= in_a_process(against_released, *what)
+            row["released_peak_mb"] = in_a_process(peak_of_a_step, *what, released_loss)
         add(f"step of {method}, {size}, N={n}, batch {batch}", row)
     for method in ("DCP_corr", "RPMNet_corr", "PCRNet_corr"):
         add(f"one pair through {method}, N=1024", in_a_process(inference, method))
@@ -96,10 +102,14 @@ def main() -> None:
             add(f"{what}, one pair, N={n}", row)
     exponents = {what: fitted(found) for what, found in growth.items()}
     for what, found in exponents.items():
-        print(f"{what}: time ~ N^{found['seconds']}, memory ~ N^{found['peak_mb']}, N >= 1024")
+        print(f"{what}: time ~ N^{found['seconds']}, memory ~ N^{found['peak_mb']}")
     place = ROOT / "results" / "bench"
     place.mkdir(parents=True, exist_ok=True)
-    about = {"threads": torch.get_num_threads(), "torch": torch.__version__}
+    about = {
+        "threads": torch.get_num_threads(),
+        "instructions": torch.backends.cpu.get_cpu_capability(),
+        "torch": torch.__version__,
+    }
     found = {**about, "rows": rows, "growth": growth, "exponents": exponents}
     (place / "bench.json").write_text(json.dumps(found, indent=1) + "\n")
     draw(growth, exponents, place / "growth.png")
@@ -122,35 +132,34 @@ def pairs_a_second() -> Row:
 
 
 def training_step(method: str, hparams: dict[str, Any], n: int, batch: int) -> Row:
-    """Milliseconds and billions of operations a pair of a training step, and its peak memory."""
+    """Milliseconds and billions of operations a pair of a training step."""
     pairs, module, step = build(method, hparams, n, batch)
-    held = held_mb()
-    seconds = median([lambda: step(ours(module, pairs))], 3 if n * batch > 2000 else 20)[0]
-    used = peak_mb() - held
+    seconds = median([lambda: step(loss_of(module, pairs))], 3 if n * batch > 2000 else 20)[0]
     with FlopCounterMode(display=False) as counter:
-        step(ours(module, pairs))
+        step(loss_of(module, pairs))
     return {
         "ms_a_pair": round(1e3 * seconds / batch, 1),
-        "peak_mb": round(used),
         "gflop_a_pair": counter.get_total_flops() / batch / 1e9,
     }
 
 
-def against_released(method: str, hparams: dict[str, Any], n: int, batch: int) -> Row:
-    """How many times longer a step in the released formulation takes, and its peak memory."""
+def peak_of_a_step(
+    method: str, hparams: dict[str, Any], n: int, batch: int, loss: Callable[..., torch.Tensor]
+) -> int:
+    """Megabytes that two steps need above what was held before."""
     pairs, module, step = build(method, hparams, n, batch)
     held = held_mb()
+    for _ in range(2):
+        step(loss(module, pairs))
+    return round(peak_mb() - held)
 
-    def released() -> torch.Tensor:
-        if method == "DCP_corr":
-            *_, c = twins.released_dcp(module.network, pairs.source, pairs.target)
-            return twins.one_hot_loss(c, pairs.match)
-        *_, matrices = twins.released_rpmnet(module.network, pairs.source, pairs.target)
-        return torch.stack([twins.one_hot_loss(c, pairs.match) for c in matrices]).sum()
 
-    both = [lambda: step(ours(module, pairs)), lambda: step(released())]
+def against_released(method: str, hparams: dict[str, Any], n: int, batch: int) -> Row:
+    """How many times longer a step in the released formulation takes."""
+    pairs, module, step = build(method, hparams, n, batch)
+    both = [lambda way=way: step(way(module, pairs)) for way in (loss_of, released_loss)]
     own, other = median(both, 1 if n * batch > 2000 else 9)
-    return {"released_ratio": round(other / own, 2), "released_peak_mb": round(peak_mb() - held)}
+    return {"released_ratio": round(other / own, 2)}
 
 
 @torch.no_grad()
@@ -159,8 +168,7 @@ def inference(method: str) -> Row:
     pairs, module, _ = build(method, {}, 1024, 1)
     module.eval()
     both: list[Callable[[], object]] = [lambda: module(pairs.source, pairs.target)]
-    twin = {"DCP_corr": twins.released_dcp, "RPMNet_corr": twins.released_rpmnet}.get(method)
-    if twin:
+    if twin := RELEASED.get(type(module.network)):
         both.append(lambda: twin(module.network, pairs.source, pairs.target))
     own, *other = median(both, 5)
     return {"ms": round(1e3 * own, 1)} | (
@@ -267,11 +275,14 @@ def grown(what: str, n: int) -> Row:
         pairs, module, step = build(what.split(",")[0], {}, n, 1)
 
         def run() -> None:
-            step(ours(module, pairs))
+            step(loss_of(module, pairs))
 
     held = held_mb()
-    seconds = median([run], 1 if n > 2048 else 3, warm=n <= 2048)[0]
-    return {"seconds": round(seconds, 4), "peak_mb": round(peak_mb() - held)}
+    seconds = median([run], 1, warm=False)[0]
+    used = peak_mb() - held  # of the first step, for large clouds as for small ones
+    if n <= 4096:
+        seconds = median([run], 3, warm=False)[0]
+    return {"seconds": round(seconds, 4), "peak_mb": round(used)}
 
 
 def _loss_and_pose(n: int) -> Callable[[], None]:
@@ -287,11 +298,10 @@ def _loss_and_pose(n: int) -> Callable[[], None]:
 
 
 def fitted(found: list[Row]) -> dict[str, float | None]:
-    """Exponents of time and memory against N, by least squares over N of at least 1024."""
-    large = [row for row in found if row["n"] >= 1024]
+    """Exponents of time from N = 1024 on, of memory from 4096: there the matrix is streamed."""
     exponents: dict[str, float | None] = {}
-    for name in ("seconds", "peak_mb"):
-        known = [(row["n"], row[name]) for row in large if row[name] > 0]
+    for name, least in (("seconds", 1024), ("peak_mb", 4096)):
+        known = [(row["n"], row[name]) for row in found if row[name] > 0 and row["n"] >= least]
         slope = np.polyfit(*np.log(known).T, 1)[0] if len(known) > 1 else None
         exponents[name] = None if slope is None else round(float(slope), 2)
     return exponents
@@ -343,12 +353,25 @@ def build(
     return pairs, module, step
 
 
-def ours(module: Any, pairs: PairBatch) -> torch.Tensor:  # noqa: ANN401
+def loss_of(module: Any, pairs: PairBatch) -> torch.Tensor:  # noqa: ANN401
     """The method's loss on these pairs."""
     return module.loss(module(pairs.source, pairs.target), pairs)
 
 
-def in_a_process(work: Callable[..., Row], *arguments: Any) -> Row:  # noqa: ANN401
+RELEASED: dict[type, Callable[..., tuple[Any, ...]]] = {
+    DCPNetwork: twins.released_dcp,
+    RPMNetwork: twins.released_rpmnet,
+}
+
+
+def released_loss(module: Any, pairs: PairBatch) -> torch.Tensor:  # noqa: ANN401
+    """The same of the same weights, in the released formulation."""
+    *_, found = RELEASED[type(module.network)](module.network, pairs.source, pairs.target)
+    matrices = found if isinstance(found, list | tuple) else [found]
+    return torch.stack([twins.one_hot_loss(c, pairs.match) for c in matrices]).sum()
+
+
+def in_a_process(work: Callable[..., Any], *arguments: Any) -> Any:  # noqa: ANN401
     """Run in a fresh process, whose peak of memory is its own."""
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=context) as pool:

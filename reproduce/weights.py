@@ -16,6 +16,8 @@ RECIPE = Path(__file__).resolve().parents[1] / "configs" / "weights.yaml"
 if __name__ == "__main__":
     words = ["fit", "--config", str(RECIPE), *sys.argv[1:]]
     known, options = parser().parse_known_args(words)
+    if known.scale == "paper":
+        sys.exit("corrmat: error: the paper has no such network: SCALE=laptop or smoke")
     code = main(words)
     if code == 0 and not known.help:
         found = recipe.load(RECIPE, known.scale, options)

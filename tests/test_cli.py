@@ -92,7 +92,7 @@ def test_bad_commands_exit_with_2(words, capsys):
     [
         (["evaluate", *FIT[1:], "--record", "x.json"], "--record goes with --models"),
         (["evaluate", *FIT[1:], "--data", "modelnet40"], "--data goes with --models"),
-        (["evaluate", *FIT[1:], "--models", "icp"], "--config is of a recipe"),
+        (["evaluate", *FIT[1:], "--models", "icp"], "--config cannot be combined with --models"),
         (["evaluate", "--models", "icp", "--data.keep", "1"], "unknown option '--data.keep'"),
         (["evaluate", "--models", "icp", "--record", "file/x.json"], "cannot write to file"),
         ([*FIT, "--runs", "file/x"], "cannot write to file/x"),

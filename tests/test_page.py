@@ -88,7 +88,7 @@ def test_the_slider_of_a_view_shows_one_stage_at_a_time(results):
     view = json.loads((results / "smoke/shapes/1.1/views.json").read_text())[0]
     found = page._view(view)
     steps = found["layout"]["sliders"][0]["steps"]
-    assert [step["label"] for step in steps] == ["before", "turn 1"]
+    assert [step["label"] for step in steps] == ["before", "iteration 1"]
     for step in steps:
         assert sum(step["args"][0]["visible"]) == 5
     names = [trace["name"] for trace in found["data"][5:]]

@@ -6,6 +6,7 @@ import resource
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -164,6 +165,42 @@ def test_a_folder_that_cannot_be_written_is_said_at_once(option, tmp_path, capsy
     assert code == 2
     assert "cannot write to" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_record_that_cannot_be_finished_leaves_whole_files(tmp_path, monkeypatch):
+    """Every file is the old or the new one; metrics.json comes last, so it is still the old."""
+    results, runs = tmp_path / "results", tmp_path / "runs"
+    folder = results / "smoke/shapes/3.2"
+
+    def record(seed):
+        recipe = load("3.2", "--seed", seed, arms=["PCRNet_corr"])
+        return experiment.run(recipe, results, runs, "none")
+
+    def files():
+        return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+    record("0")
+    old, moved = files(), []
+    replace = Path.replace
+
+    def fails_at_the_third(path, target):
+        if path.parent.name == ".3.2.partial":
+            moved.append(path.name)
+            if len(moved) == 3:
+                raise OSError("no space left on device")
+        return replace(path, target)
+
+    monkeypatch.setattr(Path, "replace", fails_at_the_third)
+    with pytest.raises(OSError, match="no space left"):
+        record("1")
+    monkeypatch.undo()
+    torn = files()
+    new = json.loads(json.dumps(record("1")))
+    assert set(torn) == set(old) == set(files())
+    assert all(torn[name] in (old[name], files()[name]) for name in torn)
+    assert torn["metrics.json"] == old["metrics.json"]
+    assert torn["per_pair.csv"] == files()["per_pair.csv"] != old["per_pair.csv"]
+    assert json.loads(files()["metrics.json"])["seed"] == new["seed"] == 1
 
 
 def test_a_reader_that_leaves_early_gets_no_traceback():

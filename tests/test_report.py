@@ -47,6 +47,17 @@ def test_the_table_has_ours_the_papers_and_both_ratios():
     assert len({len(line) for line in shown.splitlines() if "%" in line or "deg" in line}) == 1
 
 
+def test_a_test_in_bands_is_summed_up_by_the_mean_of_its_bands():
+    """The paper gives 1.4 and 2.4 in bands alone, and prints their MAE."""
+    bands = {"bands": [{"relative_euler_mae_deg": 1.0}, {"relative_euler_mae_deg": 3.0}]}
+    paper = {"DCP": bands, "DCP_corr": {"bands": [{"relative_euler_mae_deg": 0.5}, {}]}}
+    arms = {arm: found | {"relative_euler_mae_deg": 7.0} for arm, found in RECORD["arms"].items()}
+    shown = report.markdown_summary([RECORD | {"arms": arms, "bands_deg": [0, 9], "paper": paper}])
+    ours, theirs = shown.splitlines()[2:]
+    assert "| 7 → 7 |" in ours
+    assert "| 2 → - |" in theirs
+
+
 def test_refresh_writes_between_the_marks_and_nowhere_else(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("before\n<!-- results -->\nold\n<!-- /results -->\nafter\n")

@@ -9,7 +9,7 @@ from corrmat.errors import CorrmatError
 
 EPILOG = """examples:
   corrmat register source.ply target.ply -o aligned.ply --html view.html
-      how your own two clouds lie to each other (corrmat example DIR writes two to try)
+      align two clouds of your own (corrmat example DIR writes two to try)
   corrmat run --config configs/exp/1.1.yaml
       both arms at laptop scale, our numbers beside the paper's
   corrmat run --config configs/exp/1.2.yaml --scale smoke
@@ -138,7 +138,7 @@ def parser() -> argparse.ArgumentParser:
         )  # fmt: skip
         _experiment_options(command, name)
     _register_options(commands.add_parser(
-        "register", help="how two clouds of your own lie to each other", epilog=REGISTER_EPILOG,
+        "register", help="align two clouds of your own", epilog=REGISTER_EPILOG,
         formatter_class=raw,
     ))  # fmt: skip
     example = commands.add_parser("example", help="write two scans to try register on")
@@ -234,18 +234,18 @@ def _experiment_options(command: argparse.ArgumentParser, name: str) -> None:
         command.add_argument(
             "--protocol",
             choices=["paper", "real", "clean"],
-            help="of --models. real (default): disjoint samples, noise, crop and outliers in both; "
-            "clean: without crop and outliers; paper: experiment 1.2's pairs",
+            help="with --models. real (default): disjoint samples, noise, crop and outliers in "
+            "both; clean: without crop and outliers; paper: experiment 1.2's pairs",
         )
         command.add_argument("--data", choices=["shapes", "modelnet40"],
-            help="of --models; default: shapes")  # fmt: skip
-        command.add_argument("--root", type=Path, help="of --models: folder of modelnet40")
+            help="with --models; default: shapes")  # fmt: skip
+        command.add_argument("--root", type=Path, help="with --models: folder of modelnet40")
         command.add_argument("--points", type=_positive,
-            help="of --models: of a cloud before it is cropped; default: 512")  # fmt: skip
-        command.add_argument("--pairs", type=_positive, help="of --models; default: 120")
+            help="with --models: points of a cloud before it is cropped; default: 512")  # fmt: skip
+        command.add_argument("--pairs", type=_positive, help="with --models; default: 120")
         command.add_argument(
             "--record", type=Path, metavar="JSON",
-            help="of --models: write table and per-pair values",
+            help="with --models: write table and per-pair values",
         )  # fmt: skip
         command.add_argument(
             "--checkpoint", type=Path, help="default: best.ckpt of the arm's last fit or run"
@@ -380,7 +380,9 @@ def _compare(known: argparse.Namespace) -> int:
 
     for name in ("config", "arm", "checkpoint"):
         if getattr(known, name) is not None:
-            raise CorrmatError(f"--{name} is of a recipe; --models compares on a protocol's pairs")
+            raise CorrmatError(
+                f"--{name} cannot be combined with --models, which uses a protocol's pairs"
+            )
     given = {name: getattr(known, name) for name in OF_MODELS}
     how = {name: OF_MODELS[name] if value is None else value for name, value in given.items()}
     record, count, root = how.pop("record"), how.pop("pairs"), how.pop("root")
@@ -397,9 +399,11 @@ def _compare(known: argparse.Namespace) -> int:
 
 def _data(known: argparse.Namespace) -> int:
     if known.name == "shapes" and (known.root or known.mirror):
-        raise CorrmatError("--root and --mirror are of modelnet40: corrmat data modelnet40 ...")
+        raise CorrmatError("--root and --mirror go with modelnet40: corrmat data modelnet40 ...")
     if known.sheet is not None and (known.name != "shapes" or not known.sheet.parent.is_dir()):
-        raise CorrmatError(f"--sheet {known.sheet}: of shapes, and into a folder that is there")
+        raise CorrmatError(
+            f"--sheet {known.sheet}: draws the embedded shapes, into an existing folder"
+        )
     if known.name == "modelnet40":
         from corrmat import console
         from corrmat.data import modelnet40

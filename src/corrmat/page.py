@@ -75,7 +75,8 @@ def build(results: Path) -> str:
         intro=(
             "Every number comes from a file in <code>results/</code>: hover over it for the file, "
             "follow it to the record it belongs to, where the command stands that makes it again. "
-            "METHOD is red, METHOD_corr blue; dotted lines are the paper's final values."
+            "METHOD is red, METHOD_corr blue, further arms green and purple, baselines dashed "
+            "grey; dotted lines are the paper's values."
         ),
         nav=f'<a href="#summary">summary</a>{nav}<a href="#robustness">figure 2</a>',
         body="\n".join(sections),
@@ -133,9 +134,8 @@ def _summary(records: Sequence[Mapping[str, Any]]) -> str:
     for record in sorted(records, key=lambda r: (r["id"], r["scale"], r["data"])):
         for metric in ("match_accuracy", report.papers_own(record)):
             ours = [report.value_of(a, metric) for a in list(record["arms"].values())[:2]]
-            paper = [report.value_of(record["paper"].get(a, {}), metric) for a in record["arms"]][
-                :2
-            ]
+            first = list(record["arms"])[:2]
+            paper = [report.overall(record["paper"].get(a, {}), metric) for a in first]
             cells = [_linked(report.cell(v, metric), record, metric) for v in ours]
             cells.append(report.ratio(ours))
             cells += [report.cell(v, metric) for v in paper] + [report.ratio(paper)]
@@ -253,14 +253,14 @@ def _views(path: Path, name: str, plots: Plots) -> str:
 
 
 def _view(view: Mapping[str, Any]) -> dict[str, Any]:
-    """A pair that turns with the mouse, and a slider over the turns of the network."""
+    """A pair that turns with the mouse, and a slider over the network's iterations."""
     x, y, match = (np.asarray(view[key]) for key in ("source", "target", "match"))
     aside = np.array([0.6 * (np.ptp(x, 0).max() + np.ptp(y, 0).max()), 0, 0])
     last = np.asarray(view["steps"][-1]["matched"])
     stages = [("before", x, y + aside, last)]
     for number, step in enumerate(view["steps"], 1):
         moved = x @ np.asarray(step["rotation"]).T + step["translation"]
-        stages.append((f"turn {number}", moved, y, np.asarray(step["matched"])))
+        stages.append((f"iteration {number}", moved, y, np.asarray(step["matched"])))
     data: list[dict[str, Any]] = []
     for index, (_, source, target, matched) in enumerate(stages):
         outlier, right = matched == len(y), matched == match

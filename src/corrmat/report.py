@@ -47,6 +47,8 @@ def family(record: Mapping[str, Any]) -> str:
 
 def papers_own(record: Mapping[str, Any]) -> str:
     """What the paper calls a record's rotation error; the sound one for a network of one's own."""
+    if record.get("bands_deg"):
+        return "relative_euler_mae_deg"  # of both tables
     return PAPERS_OWN.get(family(record), "rotation_error_deg_mean")
 
 
@@ -124,7 +126,7 @@ def _pairwise(record: Mapping[str, Any], arms: Sequence[Mapping[str, Any]]) -> l
     names = ["match_accuracy", "rotation_error_deg_mean", "rotation_error_deg_median"]
     cells = []
     for name in [*names, papers_own(record)]:
-        values = [value_of(found, name) for found in arms]
+        values = [overall(found, name) for found in arms]
         shown = [cell(value, name) or "-" for value in values]
         cells.append(" → ".join(shown) if set(shown) != {"-"} else "")
     return cells
@@ -230,10 +232,10 @@ def markdown_bench(results: Path) -> str:
         lines.append(_row([*cells, ", ".join(ratios)]))
     lines += [""] + [
         f"- {what}, one pair of N points: time grows with N^{by['seconds']}, "
-        f"memory with N^{by['peak_mb']} (fitted from N = 1024 on)."
+        f"memory with N^{by['peak_mb']}."
         for what, by in found["exponents"].items()
     ]
-    about = f"{found['threads']} threads, torch {found['torch']}"
+    about = f"{found['threads']} threads ({found['instructions']}), torch {found['torch']}"
     return "\n".join([f"Measured with {about}.", "", *lines])
 
 
@@ -287,6 +289,14 @@ def value_of(found: Mapping[str, Any], name: str) -> float | None:
     """A metric of an arm, None where it is missing or no number."""
     value = found.get(name)
     return None if value is None or math.isnan(value) else float(value)
+
+
+def overall(found: Mapping[str, Any], name: str) -> float | None:
+    """`value_of`, or the mean over bands where no more is given: all have equally many pairs."""
+    parts = [value_of(part, name) for part in found.get("bands", [])]
+    known = [value for value in parts if value is not None]
+    own = value_of(found, name)
+    return sum(known) / len(known) if own is None and known and len(known) == len(parts) else own
 
 
 def _labels(record: Mapping[str, Any], part: str) -> list[str]:
