@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
+from matplotlib.ticker import LogFormatter, NullFormatter
 
 from corrmat.report import METRICS, family, value_of
 
@@ -108,7 +108,7 @@ def curves_figure(record: Mapping[str, Any], path: Path) -> None:
     """`panels` of a record as a PNG; what the paper gives is dotted."""
     shown = panels(record)
     rows, columns = grid(len(shown))
-    figure = Figure(figsize=(3.75 * columns, 3.6 * rows), layout="constrained")
+    figure = Figure(figsize=(3.75 * columns, 3.6 * rows + 0.4), layout="constrained")
     figure.suptitle(f"{record['id']}  {record['title']}  ({record['scale']}, {record['data']})")
     for axes, panel in zip(figure.subplots(rows, columns).flat, shown, strict=True):
         for curve in panel.curves:
@@ -118,10 +118,14 @@ def curves_figure(record: Mapping[str, Any], path: Path) -> None:
         if panel.log_x:
             axes.set_xscale("log")
             axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.set_yscale("log" if panel.log_y else "linear")
+        if panel.log_y:
+            axes.set_yscale("log")
+            axes.yaxis.set_major_formatter("{x:g}")
+            axes.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1, 0.4)))
         axes.set(title=panel.title, xlabel=panel.across)
         axes.grid(alpha=0.3)
-        axes.legend(fontsize="x-small")
+    lines = {line.get_label(): line for axes in figure.axes for line in axes.lines}
+    figure.legend(handles=list(lines.values()), loc="outside lower center", ncols=4)
     figure.savefig(path, dpi=110, metadata={"Software": None})
 
 
