@@ -41,7 +41,7 @@ weights: .venv/ready  ## train what `corrmat register` ships on the embedded sha
 protocols: .venv/ready  ## the shipped weights beside the classical pipelines (pip install open3d), into results/register
 	$(BIN)/python benchmarks/protocols.py $(if $(ROOT),--root "$(ROOT)")
 
-docs: .venv/ready  ## rewrite the tables of README.md and the pictures of docs/ from results/
+docs: .venv/ready  ## rewrite the documents' tables, redraw the pictures of docs/ and results/, from results/
 	$(BIN)/corrmat report --docs .
 	$(BIN)/corrmat data --sheet docs/shapes.png
 
@@ -63,7 +63,7 @@ test: .venv/ready  ## everything but the slow learning tests, smoke training of 
 test-slow: .venv/ready  ## learning, kill -9 at any moment, SLURM, Ray, all checksums
 	$(BIN)/pytest -m slow
 
-test-oldest: .venv/ready  ## the same on the oldest versions that pyproject.toml allows
+test-oldest: .venv/ready  ## make test on the oldest versions that pyproject.toml allows
 	$(BIN)/uv venv --clear --quiet --python $(BIN)/python .venv-oldest
 	$(BIN)/uv pip install --quiet --python .venv-oldest/bin/python --resolution lowest-direct '.[dev]'
 	.venv-oldest/bin/python -m pytest

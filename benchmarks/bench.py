@@ -2,7 +2,7 @@
 
     make bench        a table on the screen, results/bench/bench.json and results/bench/growth.png
 
-Times are medians after a warm-up (of clouds above 4096 points: the first step's); memory is the
+Times are medians after a warm-up (growth above 4096 points: the first step's); memory is the
 peak of a process of its own above what it held before its first step. A ratio says how many times
 longer the naive twin takes, in the same process, turn by turn, so that it holds on a noisy machine.
 The twins are in tests/twins.py: the same values in the released formulation (NCHW edges, whole

@@ -223,6 +223,10 @@ def test_links_damage_and_other_archives_are_refused(tmp_path):
         (tmp_path / "b.zip").write_bytes(spoilt)
         with pytest.raises(CorrmatError, match="damaged|no whole zip|leads out|does not hold"):
             unzip(tmp_path / "b.zip", tmp_path, "set")
+    named = archive(tmp_path / "b.zip", {"set/ä.txt": "in"}).read_bytes()
+    (tmp_path / "b.zip").write_bytes(named.replace("ä".encode(), b"\xff\xff"))
+    with pytest.raises(CorrmatError, match="no whole zip"):
+        unzip(tmp_path / "b.zip", tmp_path, "set")
     encrypted = bytearray(whole)
     for start in (whole.find(b"PK\x03\x04") + 6, whole.rfind(b"PK\x01\x02") + 8):
         encrypted[start] |= 1  # the flag; nobody has the key

@@ -276,7 +276,10 @@ def test_nothing_is_deleted_or_trained_when_the_test_split_cannot_be_read(tmp_pa
         ["--network.k", "0"],
         ["--network.width", "-4"],
         ["--trainer.max_steps", "-1", "--trainer.max_epochs", "-1"],
+        ["--trainer.max_steps", "-1", "--trainer.max_time", "00:00:01:00"],
+        ["--trainer.accumulate_grad_batches", "0"],
         ["--trainer.accumulate_grad_batches", "3"],  # validated after 4 batches
+        ["--trainer.accumulate_grad_batches", "2"],  # the same, counted over epochs of 9
     ):
         with pytest.raises(CorrmatError):
             experiment.run(load("1.1", *bad), tmp_path / "results", tmp_path / "runs")

@@ -72,8 +72,15 @@ def prepare(name: str, settings: Settings) -> Arm:
         raise CorrmatError(f"seed {settings.seed} is not between 0 and 2^32")
     arm = Arm(name, settings, make_datamodule(settings))
     module = make_module(settings)
+    network: Any = module.network
+    needed, points = network.min_points, arm.datamodule.how.num_source
+    if points < needed:
+        raise CorrmatError(
+            f"a source of {points} points is too small for {settings.method}, which needs "
+            f"{needed}; raise --data.num_points or lower --network.k"
+        )
     arm.datamodule.setup()
-    _refuse_schedules(settings)
+    _refuse_schedules(arm)
     _try(module, arm)
     try:
         L.Trainer(**trainer_options(settings), logger=False)
@@ -83,16 +90,26 @@ def prepare(name: str, settings: Settings) -> Arm:
     return arm
 
 
-def _refuse_schedules(settings: Settings) -> None:
-    trainer = settings.trainer
-    endless = trainer.max_epochs == -1 and trainer.max_steps == -1
-    if endless and settings.optimizer.schedule == "onecycle":
+def _refuse_schedules(arm: Arm) -> None:
+    """A rate that never ends; checkpoints, written after validation, in the middle of a step."""
+    trainer = arm.settings.trainer
+    timed = trainer.max_time is not None and trainer.max_epochs is None
+    endless = trainer.max_steps == -1 and (trainer.max_epochs == -1 or timed)
+    if endless and arm.settings.optimizer.schedule == "onecycle":
         raise CorrmatError("a one-cycle learning rate needs --trainer.max_steps or max_epochs")
-    interval, together = trainer.val_check_interval, trainer.accumulate_grad_batches
-    if isinstance(interval, int) and interval % together:
+    together, interval = trainer.accumulate_grad_batches, trainer.val_check_interval
+    if together < 1:
+        raise CorrmatError(f"--trainer.accumulate_grad_batches {together} is not positive")
+    if together == 1 or interval is None or (isinstance(interval, float) and interval == 1):
+        return  # validated after steps, or whole epochs
+    between = [interval]
+    if trainer.check_val_every_n_epoch is None:  # batches are counted over epochs
+        between.append(len(arm.datamodule.train_dataloader()))
+    if any(number % together for number in between):
         raise CorrmatError(
-            f"--trainer.val_check_interval {interval} is no multiple of accumulate_grad_batches "
-            f"{together}: a checkpoint would fall into the middle of a step"
+            f"with --trainer.accumulate_grad_batches {together}, validation after {interval} "
+            "batches would write checkpoints in the middle of a step: choose a number that divides "
+            + " and ".join(f"{number:g}" for number in between)
         )
 
 
@@ -119,7 +136,7 @@ def run(
     *,
     fresh: bool = False,
 ) -> dict[str, Any]:
-    """Train and test every arm, and write the record at one stroke when all are done.
+    """Train and test every arm, and write the record when all are done.
 
     Args:
         recipe: the experiment.
@@ -343,19 +360,13 @@ def make_module(settings: Settings) -> RegistrationModule:
     """The method of these settings, freshly initialised.
 
     Raises:
-        CorrmatError: the network cannot be built so, or the clouds are too small for it.
+        CorrmatError: the network cannot be built so.
     """
     method = METHODS[settings.method]
     try:
         network: Any = method.network_type(**settings.network.as_dict())
     except (ValueError, RuntimeError, ArithmeticError) as error:
         raise CorrmatError(f"no network of these --network options: {error}") from error
-    points = make_datamodule(settings).how.num_source
-    if points < network.min_points:
-        raise CorrmatError(
-            f"a source of {points} points is too small for {settings.method}, which needs "
-            f"{network.min_points}; raise --data.num_points or lower --network.k"
-        )
     return method(network, OptimizerSettings(**settings.optimizer.as_dict()))
 
 
@@ -373,14 +384,12 @@ def _views(
     if not isinstance(module, CorrespondenceLoss):
         return []
     module.cpu().eval()
-    sizes = [len(found["shape"]) for found in tests]
+    size = len(tests[0]["shape"])  # of every band
     errors = torch.cat([found["rotation_error_deg"] for found in tests])
     order = errors.argsort().tolist()
     found = []
     for rank, place in (("easiest", 0), ("median", len(order) // 2), ("hardest", -1)):
-        part, index = 0, order[place]
-        while index >= sizes[part]:
-            part, index = part + 1, index - sizes[part]
+        part, index = divmod(order[place], size)
         pairs = arm.datamodule.test_dataloader(**bands(recipe.bands_deg)[part]).dataset
         pair = pairs[(0, index)]
         prediction = module(pair.source, pair.target)

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter, NullFormatter
 
@@ -18,7 +19,8 @@ PANELS = {
 }
 OF_BANDS = ("match_accuracy", "relative_euler_mae_deg", "chamfer")
 OF_SWEEP = ("match_accuracy", "relative_euler_rmse_deg")
-COLOURS = ("#d62728", "#1f77b4", "#2ca02c", "#9467bd")  # METHOD red, METHOD_corr blue: the paper's
+RED, BLUE, GREEN, PURPLE = "#d62728", "#1f77b4", "#2ca02c", "#9467bd"
+COLOURS = (RED, BLUE, GREEN, PURPLE)  # METHOD red, METHOD_corr blue: the paper's
 LINES = 150  # matches drawn, at most
 
 
@@ -69,7 +71,8 @@ def _training(record: Mapping[str, Any], name: str) -> Panel:
             curves.append(Curve(arm, colour, seen, [factor * v for v in values if v is not None]))
         final = value_of(record["paper"].get(arm, {}), name)
         if seen and final is not None:
-            curves.append(Curve(arm, colour, [seen[0], seen[-1]], [factor * final] * 2, paper=True))
+            ends = [min(seen[0], seen[-1] // 2), seen[-1]]
+            curves.append(Curve(arm, colour, ends, [factor * final] * 2, paper=True))
     apart = max(most) > 4 * min(most[1:], default=1)  # PCRNet's arms share minutes, not pairs
     log_y = name not in ("loss", "match_accuracy")
     return Panel(title, "training pairs seen", apart, log_y, curves)
@@ -104,6 +107,13 @@ def grid(number: int) -> tuple[int, int]:
     return rows, -(-number // rows)
 
 
+class _Plain(LogFormatter):
+    """Labels between powers of ten where there is room, as 0.2 and not as 2e-01."""
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        return super().__call__(x, pos) and f"{x:g}"
+
+
 def curves_figure(record: Mapping[str, Any], path: Path) -> None:
     """`panels` of a record as a PNG; what the paper gives is dotted."""
     shown = panels(record)
@@ -121,7 +131,7 @@ def curves_figure(record: Mapping[str, Any], path: Path) -> None:
         if panel.log_y:
             axes.set_yscale("log")
             axes.yaxis.set_major_formatter("{x:g}")
-            axes.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1, 0.4)))
+            axes.yaxis.set_minor_formatter(_Plain(minor_thresholds=(1, 0.4)))
         axes.set(title=panel.title, xlabel=panel.across)
         axes.grid(alpha=0.3)
     lines = {line.get_label(): line for axes in figure.axes for line in axes.lines}
@@ -157,14 +167,14 @@ def matches_figure(view: Mapping[str, Any], title: str, path: Path) -> None:
         (both[0], x, aside, "source, target set aside, matches"),
         (both[1], aligned, y, "registered"),
     ):
-        for i in np.flatnonzero(~outlier)[:LINES]:
-            colour = "#2ca02c" if right[i] else "#d62728"
-            ends = np.stack([source[i], target[called[i]]])
-            axes.plot(*ends.T, color=colour, lw=0.5, alpha=0.6, zorder=1)
+        drawn = np.flatnonzero(~outlier)[:LINES]
+        ends = np.stack([source[drawn], target[called[drawn]]], 1)
+        colours = np.where(right[drawn], GREEN, RED)
+        axes.add_collection(LineCollection(list(ends), colors=colours, lw=0.5, alpha=0.6, zorder=1))
         axes.scatter(*target.T, s=22, color="#9ecae9", linewidths=0, label="target")
         axes.scatter(*source.T, s=4, color="black", linewidths=0, label="source")
         if outlier.any():
-            rings = np.where(right[outlier], "#2ca02c", "#d62728")
+            rings = np.where(right[outlier], GREEN, RED)
             axes.scatter(
                 *source[outlier].T, s=60, facecolors="none", edgecolors=rings,
                 label="called outlier",

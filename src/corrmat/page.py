@@ -15,9 +15,8 @@ import numpy as np
 from plotly.offline import get_plotlyjs
 
 from corrmat import report
-from corrmat.figures import COLOURS, grid, panels
+from corrmat.figures import BLUE, COLOURS, GREEN, RED, grid, panels
 
-GREEN, RED, BLUE = "#2ca02c", "#d62728", "#1f77b4"
 # What a family's numbers depend on, below src/corrmat; the recipes come on top.
 CODE = (
     "ops/rigid.py", "ops/correspondence.py", "ops/streaming.py",
@@ -86,7 +85,9 @@ def build(results: Path) -> str:
 
 
 def command(record: Mapping[str, Any]) -> str:
-    """What makes a record again."""
+    """What makes a record again; a recipe of one's own has no make target."""
+    if not (Path(__file__).parents[2] / "configs" / "exp" / f"{record['id']}.yaml").is_file():
+        return f"corrmat run --config ... --scale {record['scale']}"
     target = record["id"] if record["id"] == "outliers" else f"exp{record['id']}"
     scale = "" if record["scale"] == "laptop" else f" SCALE={record['scale']}"
     data = "" if record["data"] == "shapes" else f" DATA={record['data']} ROOT=..."
@@ -133,7 +134,7 @@ def _summary(records: Sequence[Mapping[str, Any]]) -> str:
     rows = []
     for record in sorted(records, key=lambda r: (r["id"], r["scale"], r["data"])):
         for metric in ("match_accuracy", report.papers_own(record)):
-            ours = [report.value_of(a, metric) for a in list(record["arms"].values())[:2]]
+            ours = [report.overall(a, metric) for a in list(record["arms"].values())[:2]]
             first = list(record["arms"])[:2]
             paper = [report.overall(record["paper"].get(a, {}), metric) for a in first]
             cells = [_linked(report.cell(v, metric), record, metric) for v in ours]
@@ -159,7 +160,7 @@ def _article(record: Mapping[str, Any], results: Path, plots: Plots) -> str:
     parts = [
         f'<article id="{name}"><h3>{escape(record["scale"])}, {escape(record["data"])}</h3>',
         _provenance(record, source),
-        _plot(f"{name}-curves", "Training curves"),
+        _plot(f"{name}-curves", "Curves"),
         _plot(f"{name}-errors", "Share of test pairs below each rotation error"),
         f"<details><summary>All numbers</summary>{_table(heads, cells)}</details>",
         _views(folder / "views.json", name, plots),

@@ -206,14 +206,11 @@ def markdown_bench(results: Path) -> str:
     if not path.is_file():
         return "No benchmark is recorded."
     found = json.loads(path.read_text())
-    others = {
-        "released_ratio": "released",
-        "naive_ratio": "naive",
-        "dense_ratio": "dense",
-    }
     heads = ["what", "ms", "peak memory, MB", "share of the matrix product's GFLOP/s"]
     lines = [_row([*heads, "the other way takes"]), "|---" * 5 + "|"]
     for row in found["rows"]:
+        if "not_measured" in row:
+            continue
         seconds = row["seconds"] * 1e3 if "seconds" in row else None
         time = next((row[name] for name in ("ms_a_pair", "ms") if name in row), seconds)
         cells = [
@@ -226,16 +223,16 @@ def markdown_bench(results: Path) -> str:
             str(row.get("peak_mb", "")),
             f"{row['peak_share']:.0%}" if "peak_share" in row else "",
         ]
-        ratios = [f"{row[key]} x ({name})" for key, name in others.items() if key in row]
+        ratios = [f"{v} x ({k.removesuffix('_ratio')})" for k, v in row.items() if "_ratio" in k]
         if "released_peak_mb" in row:
             ratios.append(f"{row['released_peak_mb']} MB")
         lines.append(_row([*cells, ", ".join(ratios)]))
     lines += [""] + [
-        f"- {what}, one pair of N points: time grows with N^{by['seconds']}, "
-        f"memory with N^{by['peak_mb']}."
+        f"- {what}, one pair of N points: time grows with N^{by['seconds']} (from N = 1024 on), "
+        f"memory with N^{by['peak_mb']} (from N = 4096 on, where no matrix is whole)."
         for what, by in found["exponents"].items()
     ]
-    about = f"{found['threads']} threads ({found['instructions']}), torch {found['torch']}"
+    about = f"{found['threads']} threads ({found.get('instructions')}), torch {found['torch']}"
     return "\n".join([f"Measured with {about}.", "", *lines])
 
 

@@ -8,7 +8,6 @@ import stat
 import urllib.error
 import urllib.request
 import zipfile
-import zlib
 from collections.abc import Sequence
 from http.client import HTTPException, HTTPResponse
 from pathlib import Path
@@ -103,8 +102,10 @@ def unzip(archive: Path, folder: Path, name: str) -> None:
         if not (aside / name).is_dir():
             raise CorrmatError(f"{archive} does not hold the folder {name}")
         (aside / name).replace(folder / name)
-    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
-        # Of a damaged, encrypted or unknown compression, in the words of as many libraries.
+    except (CorrmatError, OSError):
+        raise
+    # Damaged, encrypted or oddly packed archives fail in the words of as many libraries.
+    except Exception as error:
         raise CorrmatError(f"{archive} is no whole zip file; {_again(archive)}") from error
     finally:
         shutil.rmtree(aside, ignore_errors=True)
