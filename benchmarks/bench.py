@@ -11,6 +11,7 @@ matrices, an SVD a pair, target features anew).
 
 import contextlib
 import json
+import logging
 import multiprocessing
 import resource
 import statistics
@@ -24,6 +25,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 import torch
+import torch._inductor.config
 from matplotlib import pyplot as plt
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -36,7 +38,7 @@ from corrmat.aligners import CLASSICAL  # noqa: E402
 from corrmat.data import shapes  # noqa: E402
 from corrmat.data.pairs import Key, PairSettings, make_pairs  # noqa: E402
 from corrmat.errors import CorrmatError  # noqa: E402
-from corrmat.experiment import keep_freed_memory  # noqa: E402
+from corrmat.experiment import keep_freed_memory, make_module, prepare  # noqa: E402
 from corrmat.losses import chamfer_loss, correspondence_loss  # noqa: E402
 from corrmat.methods import METHODS  # noqa: E402
 from corrmat.networks.dcp import DCPNetwork  # noqa: E402
@@ -45,6 +47,7 @@ from corrmat.ops import streaming  # noqa: E402
 from corrmat.ops.correspondence import SinkhornCorrespondence, SoftCorrespondence  # noqa: E402
 from corrmat.ops.neighbors import within_radius  # noqa: E402
 from corrmat.ops.rigid import procrustes  # noqa: E402
+from corrmat.recipe import load as load_recipe  # noqa: E402
 from corrmat.types import PairBatch  # noqa: E402
 
 Row = dict[str, Any]
@@ -61,6 +64,7 @@ STEPS: tuple[tuple[str, dict[str, Any], int, int], ...] = (
     ("PCRNet_corr", {}, 1024, 32),
     ("PCRNet", {}, 100, 8),
 )
+COMPILED = (STEPS[0], STEPS[5])
 POINTS = (256, 512, 1024, 2048, 4096, 8192, 16384)
 GROWTH = {"DCP_corr, a step": POINTS, "RPMNet_corr, a step": POINTS[:6], "loss and pose": POINTS}
 
@@ -87,6 +91,10 @@ def main() -> None:
             row |= in_a_process(against_released, *what)
             row["released_peak_mb"] = in_a_process(peak_of_a_step, *what, released_loss)
         add(f"step of {method}, {size}, N={n}, batch {batch}", row)
+    for method, hparams, n, batch in COMPILED:
+        row = in_a_process(against_compiled, method, hparams, n, batch)
+        first = row.pop("first_step_s")
+        add(f"step of {method}, N={n}, batch {batch}, by torch.compile after {first} s", row)
     for method in ("DCP_corr", "RPMNet_corr", "PCRNet_corr"):
         add(f"one pair through {method}, N=1024", in_a_process(inference, method))
     add("one pair through FPFH + RANSAC, N=1024", in_a_process(classical, "ransac"))
@@ -103,6 +111,13 @@ def main() -> None:
     exponents = {what: fitted(found) for what, found in growth.items()}
     for what, found in exponents.items():
         print(f"{what}: time ~ N^{found['seconds']}, memory ~ N^{found['peak_mb']}")
+    recipes: dict[str, dict[str, float]] = {}
+    for path in sorted((ROOT / "configs" / "exp").glob("*.yaml")):
+        recipe = load_recipe(path, "laptop", [])
+        if recipe.networks_of is None:
+            arms = {arm: in_a_process(minutes_of, path, arm) for arm in recipe.settings}
+            recipes[recipe.id] = arms
+            print(f"minutes of {recipe.id} at laptop scale: {arms}", flush=True)
     place = ROOT / "results" / "bench"
     place.mkdir(parents=True, exist_ok=True)
     about = {
@@ -110,10 +125,38 @@ def main() -> None:
         "instructions": torch.backends.cpu.get_cpu_capability(),
         "torch": torch.__version__,
     }
-    found = {**about, "rows": rows, "growth": growth, "exponents": exponents}
+    found = {**about, "rows": rows, "growth": growth, "exponents": exponents, "recipes": recipes}
     (place / "bench.json").write_text(json.dumps(found, indent=1) + "\n")
     draw(growth, exponents, place / "growth.png")
     print(f"written: {place.relative_to(ROOT)}/bench.json, growth.png")
+
+
+def minutes_of(path: Path, arm: str) -> float:
+    """Minutes that training an arm of a recipe takes, by its steps and validation batches."""
+    logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
+    keep_freed_memory()
+    settings = load_recipe(path, "laptop", [], [arm]).settings[arm]
+    ready = prepare(arm, settings)
+    module, trainer = make_module(settings), settings.trainer
+    train, held_out = ready.datamodule.train_dataloader(), ready.datamodule.val_dataloader()
+    adam = torch.optim.Adam(module.parameters(), 1e-4, fused=True)
+    pairs, checked = iter(train), iter(held_out)
+
+    def step() -> None:
+        batch = next(pairs)
+        adam.zero_grad()
+        loss_of(module, batch).backward()
+        torch.nn.utils.clip_grad_norm_(module.parameters(), trainer.gradient_clip_val)
+        adam.step()
+
+    @torch.no_grad()
+    def check() -> None:
+        batch = next(checked)
+        module.metrics.update(module(batch.source, batch.target), batch)
+
+    step_s, check_s = median([step], 15)[0], median([check], 3)[0]
+    checks = trainer.max_steps / trainer.val_check_interval * trainer.limit_val_batches
+    return round((trainer.max_steps * step_s + checks * check_s) / 60, 1)
 
 
 def matmul_peak() -> Row:
@@ -160,6 +203,24 @@ def against_released(method: str, hparams: dict[str, Any], n: int, batch: int) -
     both = [lambda way=way: step(way(module, pairs)) for way in (loss_of, released_loss)]
     own, other = median(both, 1 if n * batch > 2000 else 9)
     return {"released_ratio": round(other / own, 2)}
+
+
+def against_compiled(method: str, hparams: dict[str, Any], n: int, batch: int) -> Row:
+    """A training step of the network by torch.compile, and how many times longer it takes as is."""
+    torch._inductor.config.force_disable_caches = True  # pyright: ignore[reportPrivateUsage]
+    pairs, module, step = build(method, hparams, n, batch)
+    network = torch.compile(module.network, dynamic=False)
+
+    def compiled() -> None:
+        step(module.loss(network(pairs.source, pairs.target), pairs))
+
+    (first,) = median([compiled], 1, warm=False)
+    own, eager = median([compiled, lambda: step(loss_of(module, pairs))], 9)
+    return {
+        "ms_a_pair": round(1e3 * own / batch, 1),
+        "eager_ratio": round(eager / own, 2),
+        "first_step_s": round(first),
+    }
 
 
 @torch.no_grad()

@@ -232,6 +232,13 @@ def markdown_bench(results: Path) -> str:
         f"memory with N^{by['peak_mb']} (from N = 4096 on, where no matrix is whole)."
         for what, by in found["exponents"].items()
     ]
+    lines += [
+        "",
+        "Minutes of training an arm of a laptop recipe, alone on the machine:",
+        "",
+    ]
+    for recipe, arms in found.get("recipes", {}).items():
+        lines.append(f"- {recipe}: " + ", ".join(f"{arm} {m}" for arm, m in arms.items()))
     about = f"{found['threads']} threads ({found.get('instructions')}), torch {found['torch']}"
     return "\n".join([f"Measured with {about}.", "", *lines])
 
