@@ -291,7 +291,7 @@ def _view(view: Mapping[str, Any]) -> dict[str, Any]:
     return {"data": data, "layout": layout}
 
 
-def _thinned(points: np.ndarray, most: int = 160) -> np.ndarray:
+def _thinned(points: np.ndarray, most: int = 130) -> np.ndarray:
     """Every so many points, so that the page stays small."""
     return points[:: -(-len(points) // most)]
 
