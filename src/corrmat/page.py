@@ -41,7 +41,7 @@ FAMILY_CODE = {
     ),
     "PCRNet": ("networks/pcrnet.py", "networks/pointnet.py", "networks/compare.py"),
 }
-QUANTILES = np.linspace(0, 1, 201)
+QUANTILES = np.linspace(0, 1, 101)
 Plots = dict[str, dict[str, Any]]
 
 
@@ -291,7 +291,7 @@ def _view(view: Mapping[str, Any]) -> dict[str, Any]:
     return {"data": data, "layout": layout}
 
 
-def _thinned(points: np.ndarray, most: int = 130) -> np.ndarray:
+def _thinned(points: np.ndarray, most: int = 120) -> np.ndarray:
     """Every so many points, so that the page stays small."""
     return points[:: -(-len(points) // most)]
 
