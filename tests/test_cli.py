@@ -99,7 +99,10 @@ def test_bad_commands_exit_with_2(words, capsys):
         ([*FIT, "--seed", "5000000000"], "seed 5000000000 is not between"),
         (["robustness", "--scale", "smoke", "--results", "file/x"], "cannot write to file/x"),
         (["data", "--root", "x"], "--root and --mirror go with modelnet40"),
-        (["data", "modelnet40", "--root", "x", "--sheet", "a.png"], "--sheet a.png: draws the embedded"),
+        (
+            ["data", "modelnet40", "--root", "x", "--sheet", "a.png"],
+            "--sheet a.png: draws the embedded",
+        ),
         (["data", "modelnet40", "--root", "file/x"], "file"),
         (["register", "a.ply", "b.ply", "-o", "moved.xyz"], "written as PLY"),
     ],

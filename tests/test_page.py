@@ -84,6 +84,11 @@ def test_every_number_names_the_file_and_the_command_it_comes_from(results):
     assert linked <= set(re.findall(r'id="([^"]+)"', html))
 
 
+def test_a_record_of_ones_own_recipe_has_no_make_target():
+    record = {"id": "mine", "scale": "laptop", "data": "shapes", "seed": 0, "paper": {}}
+    assert page.command(record) == "corrmat run --config ... --scale laptop"
+
+
 def test_the_slider_of_a_view_shows_one_stage_at_a_time(results):
     view = json.loads((results / "smoke/shapes/1.1/views.json").read_text())[0]
     found = page._view(view)

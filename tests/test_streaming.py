@@ -85,6 +85,6 @@ print((peak() - before) / 1024)
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_memory_is_not_that_of_the_matrix():
-    """8192 x 8192 floats are 256 MB, and the dense way holds several of them."""
+    """8192 x 8192 floats are 256 MB, and the dense way holds several of them at once."""
     found = subprocess.run([sys.executable, "-c", MEMORY], capture_output=True, text=True)
-    assert 0 < float(found.stdout) < 120, found.stderr
+    assert 0 < float(found.stdout) < 200, found.stderr

@@ -86,7 +86,7 @@ def build(results: Path) -> str:
 
 def command(record: Mapping[str, Any]) -> str:
     """What makes a record again; a recipe of one's own has no make target."""
-    if not (Path(__file__).parents[2] / "configs" / "exp" / f"{record['id']}.yaml").is_file():
+    if not record["paper"]:
         return f"corrmat run --config ... --scale {record['scale']}"
     target = record["id"] if record["id"] == "outliers" else f"exp{record['id']}"
     scale = "" if record["scale"] == "laptop" else f" SCALE={record['scale']}"
