@@ -25,7 +25,6 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 import torch
-import torch._inductor.config
 from matplotlib import pyplot as plt
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -207,7 +206,9 @@ def against_released(method: str, hparams: dict[str, Any], n: int, batch: int) -
 
 def against_compiled(method: str, hparams: dict[str, Any], n: int, batch: int) -> Row:
     """A training step of the network by torch.compile, and how many times longer it takes as is."""
-    torch._inductor.config.force_disable_caches = True  # pyright: ignore[reportPrivateUsage]
+    from torch._inductor import config  # takes seconds, and no other row needs it
+
+    config.force_disable_caches = True
     pairs, module, step = build(method, hparams, n, batch)
     network = torch.compile(module.network, dynamic=False)
 

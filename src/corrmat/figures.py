@@ -62,10 +62,10 @@ def panels(record: Mapping[str, Any]) -> list[Panel]:
 def _training(record: Mapping[str, Any], name: str) -> Panel:
     title, _, factor = METRICS.get(name, ("training loss", "", 1))
     curves = []
-    most = [1]
+    lengths = []
     for arm, colour, found in _arms(record):
         seen = [point["pairs_seen"] for point in found["curve"]]
-        most.append(max(seen, default=1))
+        lengths.append(max(seen, default=1))
         values = [value_of(point, name) for point in found["curve"]]
         if seen and None not in values:
             curves.append(Curve(arm, colour, seen, [factor * v for v in values if v is not None]))
@@ -73,7 +73,7 @@ def _training(record: Mapping[str, Any], name: str) -> Panel:
         if seen and final is not None:
             ends = [min(seen[0], seen[-1] // 2), seen[-1]]
             curves.append(Curve(arm, colour, ends, [factor * final] * 2, paper=True))
-    apart = max(most) > 4 * min(most[1:], default=1)  # PCRNet's arms share minutes, not pairs
+    apart = max(lengths) > 4 * min(lengths)  # PCRNet's arms share minutes, not pairs
     log_y = name not in ("loss", "match_accuracy")
     return Panel(title, "training pairs seen", apart, log_y, curves)
 

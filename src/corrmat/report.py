@@ -237,9 +237,9 @@ def markdown_bench(results: Path) -> str:
         "Minutes of training an arm of a laptop recipe, alone on the machine:",
         "",
     ]
-    for recipe, arms in found.get("recipes", {}).items():
+    for recipe, arms in found["recipes"].items():
         lines.append(f"- {recipe}: " + ", ".join(f"{arm} {m}" for arm, m in arms.items()))
-    about = f"{found['threads']} threads ({found.get('instructions')}), torch {found['torch']}"
+    about = f"{found['threads']} threads ({found['instructions']}), torch {found['torch']}"
     return "\n".join([f"Measured with {about}.", "", *lines])
 
 
@@ -297,10 +297,11 @@ def value_of(found: Mapping[str, Any], name: str) -> float | None:
 
 def overall(found: Mapping[str, Any], name: str) -> float | None:
     """`value_of`, or the mean over bands where no more is given: all have equally many pairs."""
-    parts = [value_of(part, name) for part in found.get("bands", [])]
-    known = [value for value in parts if value is not None]
     own = value_of(found, name)
-    return sum(known) / len(known) if own is None and known and len(known) == len(parts) else own
+    if own is not None or not found.get("bands"):
+        return own
+    parts = [value for part in found["bands"] if (value := value_of(part, name)) is not None]
+    return sum(parts) / len(parts) if len(parts) == len(found["bands"]) else None
 
 
 def _labels(record: Mapping[str, Any], part: str) -> list[str]:
