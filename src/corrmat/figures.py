@@ -158,7 +158,8 @@ def matches_figure(view: Mapping[str, Any], title: str, path: Path) -> None:
     x, y, aligned = map(_seen, (x, y, aligned))
     # The target is set aside, so that lines do not hide in the clouds.
     aside = y - [y[:, 0].min() - x[:, 0].max() - 0.3 * np.ptp(y[:, 0]), 0]
-    wide = [box[0] / box[1] for box in (_box(x, aside), _box(aligned, y))]
+    boxes = _box(x, aside), _box(aligned, y)
+    wide = [min(max(box[0] / box[1], 1), 3) for box in boxes]  # room for the headings
     height = min(1 + 10 / sum(wide), 6)
     figure = Figure(figsize=(10, height), layout="constrained")
     figure.suptitle(f"{title}: {100 * right[inlier].mean():.0f} % of the matches are right")
