@@ -50,7 +50,7 @@ from corrmat.recipe import load as load_recipe  # noqa: E402
 from corrmat.types import PairBatch  # noqa: E402
 
 Row = dict[str, Any]
-DCP_LAPTOP = {"width": 128, "feedforward": 256, "edge_channels": (32, 32, 64, 128), "k": 6}
+DCP_LAPTOP = {"width": 96, "feedforward": 192, "edge_channels": (32, 32, 64, 128), "k": 6}
 RPMNET_LAPTOP = {"width": 32, "k": 32, "annealing_width": 256}
 # method, hyper-parameters, points, batch
 STEPS: tuple[tuple[str, dict[str, Any], int, int], ...] = (
