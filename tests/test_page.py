@@ -113,6 +113,8 @@ def test_a_record_whose_code_has_changed_is_marked(tmp_path):
     code = tmp_path / "src" / "corrmat" / "losses.py"
     code.parent.mkdir(parents=True)
     code.write_text("a = 1\n")
+    (tmp_path / "configs" / "exp").mkdir(parents=True)
+    (tmp_path / "configs" / "exp" / "1.1.yaml").write_text('id: "1.1"\n')
     git("init", "-q")
     git("add", "-A")
     git("commit", "-qm", "first")
@@ -121,8 +123,14 @@ def test_a_record_whose_code_has_changed_is_marked(tmp_path):
     assert page.staleness(found, tmp_path) == ""
     (tmp_path / "README.md").write_text("words change nothing\n")
     assert page.staleness(found, tmp_path) == ""
-    code.write_text("# nor does a comment\n\na = 1\n")
+    code.write_text('"""Nor does a docstring."""\n\n# nor a comment\na = (1)\n')
     assert page.staleness(found, tmp_path) == ""
+    recipe = tmp_path / "configs" / "exp" / "1.1.yaml"
+    recipe.write_text("id: '1.1'  # of the paper\n")
+    assert page.staleness(found, tmp_path) == ""
+    recipe.write_text("id: '1.1'\nseed: 1\n")
+    assert page.staleness(found, tmp_path) == "changed since: 1.1.yaml"
+    git("checkout", "configs")
     code.write_text("a = 2\n")
     assert page.staleness(found, tmp_path) == "changed since: losses.py"
     code.write_text("a = 1\n")

@@ -1,7 +1,8 @@
 """What a method is trained on: one mixin a loss, over a plain function.
 
-A method is a mixin in front of `RegistrationModule`: the paper's METHOD and METHOD_corr
-differ in this one base class and in nothing else.
+A method is a mixin in front of `RegistrationModule`. DCP and DCP_corr differ in this one base
+class and in nothing else; RPMNet's two in their learning rate as well, PCRNet's in their network
+(paper section 5).
 """
 
 from collections.abc import Sequence
@@ -14,7 +15,7 @@ from corrmat.ops.correspondence import MatchabilityCorrespondence, SoftCorrespon
 from corrmat.ops.neighbors import nearest, take
 from corrmat.types import PairBatch, Prediction
 
-DISCOUNT = 0.5  # of a turn against the next
+DISCOUNT = 0.5  # of an iteration against the next
 INLIER_WEIGHT = 0.01
 
 
@@ -52,7 +53,7 @@ def correspondence_loss(c: SoftCorrespondence, match: Tensor) -> Tensor:
 
 
 def registration_loss(prediction: Prediction, batch: PairBatch) -> Tensor:
-    """One turn of L_RPMNet: mean L1 distance of source points, and doubt (paper section 5.2).
+    """One iteration of L_RPMNet: mean L1 distance of source points, and doubt (paper section 5.2).
 
     Doubt is how much the rows and columns of the matrix lack to one, on average, times 0.01:
     RPM-Net's L_inlier, which keeps it from calling every point unmatched.
@@ -117,7 +118,7 @@ def mutual_loss(c: MatchabilityCorrespondence, matches: tuple[Tensor, Tensor]) -
 
 
 def discounted(losses: Sequence[Tensor]) -> Tensor:
-    """Sum over the turns of an iterative network, each worth half the next (RPM-Net)."""
+    """Sum over the iterations of a network, each worth half the next (RPM-Net)."""
     total = losses[0]
     for loss in losses[1:]:
         total = DISCOUNT * total + loss
@@ -138,7 +139,7 @@ class CorrespondenceLoss:
     """Train on the correspondence matrix: METHOD_corr."""
 
     def loss(self, prediction: Prediction, batch: PairBatch) -> Tensor:
-        """`correspondence_loss` of a batch, `discounted` over the turns if there are several."""
+        """`correspondence_loss` of a batch, `discounted` over iterations, if there are any."""
         found = [step.correspondence for step in prediction.steps]
         if None in found:
             raise ValueError("this network predicts no correspondence to train on")
@@ -165,7 +166,7 @@ class RegistrationLoss:
     """Train on distances of transformed points: METHOD, for RPMNet."""
 
     def loss(self, prediction: Prediction, batch: PairBatch) -> Tensor:
-        """`registration_loss` of a batch, `discounted` over the turns."""
+        """`registration_loss` of a batch, `discounted` over the iterations."""
         return discounted([registration_loss(step, batch) for step in prediction.steps])
 
 

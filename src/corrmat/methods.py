@@ -52,7 +52,7 @@ class RPMNet(RegistrationLoss, Method):
 
 
 class RPMNetCorr(CorrespondenceLoss, Method):
-    """RPM-Net, trained on the correspondence matrix of every turn; its rate falls to 1e-4."""
+    """RPM-Net, trained on the correspondence matrix of every iteration; its rate falls to 1e-4."""
 
     network_type = RPMNetwork
     paper_optimizer = OptimizerSettings(1e-2, 0.0, milestones=(500, 750), gamma=0.1)

@@ -1,6 +1,6 @@
 """How far off a prediction is: per-pair functions, and one torchmetrics class on them.
 
-The paper's own metrics stand beside the sound ones under names that tell them apart (SPEC: 5).
+The paper's own metrics stand beside the sound ones under names that tell them apart.
 """
 
 import numpy as np
@@ -211,7 +211,7 @@ class RegistrationMetrics(Metric):
 
 
 def summary(per_pair: dict[str, Tensor]) -> dict[str, float]:
-    """Metrics of many pairs (SPEC: 5): angles in degrees, lengths in units of the unit sphere.
+    """Metrics of many pairs: angles in degrees, lengths in units of the unit sphere.
 
     A pair whose prediction is not finite is counted in `failed`, makes means NaN, and is a
     miss in `recall`.

@@ -14,7 +14,7 @@ from corrmat.types import PairBatch, Prediction
 
 @dataclass(frozen=True)
 class OptimizerSettings:
-    """Adam and its schedule; the defaults are DCP's (SPEC: 3).
+    """Adam and its schedule; the defaults are DCP's, as released.
 
     Args:
         lr: learning rate; the peak of a one-cycle schedule.

@@ -1,5 +1,6 @@
 """All records on one page that needs no server and no network."""
 
+import ast
 import csv
 import itertools
 import json
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from plotly.offline import get_plotlyjs
 
 from corrmat import report
@@ -109,23 +111,38 @@ def staleness(record: Mapping[str, Any], repository: Path) -> str:
     commits = {str(arm.get("trained_at") or record.get("commit")) for arm in arms}
     if any(commit == "None" or commit.endswith("+") for commit in commits):
         return "trained with uncommitted code"
+
+    def git(*words: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(["git", *words], cwd=repository, capture_output=True, text=True)
+
     changed: set[str] = set()
     for commit in commits:
-        # Lines that are blank or hold a comment change no number.
-        lines = "-G^[[:space:]]*[^#[:space:]]"
         try:
-            found = subprocess.run(
-                ["git", "diff", "--name-only", lines, commit, "--", *code],
-                cwd=repository, capture_output=True, text=True,
-            )  # fmt: skip
+            found = git("diff", "--name-only", "--relative", commit, "--", *code)
         except OSError:
             return "git is not at hand, so nobody can tell whether the code has changed"
         if found.returncode:
             return (
                 f"commit {commit} is not at hand, so nobody can tell whether the code has changed"
             )
-        changed |= {Path(name).name for name in found.stdout.split()}
+        for name in found.stdout.split():
+            then, now = git("show", f"{commit}:./{name}"), repository / name
+            same = not then.returncode and now.exists()
+            if not (same and _says(name, then.stdout) == _says(name, now.read_text())):
+                changed.add(now.name)
     return f"changed since: {', '.join(sorted(changed))}" if changed else ""
+
+
+def _says(name: str, text: str) -> object:
+    """What a recipe or a module says to the machine: comments and docstrings left out."""
+    if name.endswith(".yaml"):
+        return yaml.safe_load(text)
+    tree = ast.parse(text)
+    for node in ast.walk(tree):
+        documented = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+        if documented and ast.get_docstring(node, clean=False) is not None:
+            del node.body[0]
+    return ast.dump(tree)
 
 
 def _summary(records: Sequence[Mapping[str, Any]]) -> str:

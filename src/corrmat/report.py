@@ -9,7 +9,7 @@ from typing import Any
 
 from corrmat.errors import CorrmatError
 
-# metric -> (heading, format, factor); the sound ones first, then the paper's (SPEC: 5).
+# metric -> (heading, format, factor); the sound ones first, then the paper's.
 METRICS: dict[str, tuple[str, str, float]] = {
     "match_accuracy": ("correct matches, %", ".1f", 100),
     "rotation_error_deg_mean": ("rotation error, mean, deg", ".3g", 1),

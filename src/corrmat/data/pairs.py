@@ -1,4 +1,4 @@
-"""A clean cloud becomes a pair of clouds with its truth (SPEC: 2, paper section 5).
+"""A clean cloud becomes a pair of clouds with its truth (paper section 5).
 
 Chance and geometry are kept apart. Everything random about one pair is drawn by `draw`
 from a generator keyed by (seed, stream, epoch, index), so a pair does not depend on the

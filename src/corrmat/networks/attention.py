@@ -1,4 +1,4 @@
-"""DCP's transformer: one encoder and one decoder block, pre-norm, no dropout (SPEC: 3, DCP)."""
+"""DCP's transformer: one encoder and one decoder block, pre-norm, no dropout, as released."""
 
 import torch
 import torch.nn.functional as F

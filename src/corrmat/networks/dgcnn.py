@@ -1,4 +1,4 @@
-"""DGCNN's edge convolutions over one fixed neighbour graph, as DCP uses them (SPEC: 3, DCP)."""
+"""DGCNN's edge convolutions over one fixed neighbour graph, as DCP's released code has them."""
 
 import torch
 import torch.nn.functional as F

@@ -14,13 +14,13 @@ from corrmat.types import Prediction, with_earlier
 class PCRNetwork(nn.Module):
     """Regresses a pose from the two clouds' global features, again and again (section 5.3).
 
-    Every turn moves the source by the pose found and composes the poses, with their gradient.
-    The last layer starts near the identity pose: from an arbitrary one, eight turns wander
+    Every iteration moves the source by the pose found and composes the poses, with their gradient.
+    The last layer starts near the identity pose: from an arbitrary one, eight of them wander
     off and nothing is learnt.
 
     Args:
         width: dimension of a cloud's global feature.
-        iterations: turns.
+        iterations: how often the pose is corrected.
     """
 
     min_points = 1

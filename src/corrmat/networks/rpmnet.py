@@ -19,7 +19,7 @@ from corrmat.types import Prediction, with_earlier
 class RPMNetwork(nn.Module):
     """Features of neighbourhoods, annealed affinities, Sinkhorn, weighted Procrustes; again.
 
-    Every turn moves the source by the transform so far (without its gradient) and looks
+    Every iteration moves the source by the transform so far (without its gradient) and looks
     again. The target never moves, so its features are computed once; neighbours and pair
     features of either cloud never change.
 
@@ -27,9 +27,9 @@ class RPMNetwork(nn.Module):
         width: feature dimension d, a multiple of 8.
         k: neighbours of each point.
         radius: within which they lie, in units of the clouds.
-        iterations: turns in training.
-        test_iterations: turns in evaluation.
-        sinkhorn_iterations: normalisations of rows and columns a turn.
+        iterations: how many in training.
+        test_iterations: how many in evaluation.
+        sinkhorn_iterations: normalisations of rows and columns in each.
         slack: see `sinkhorn_potentials`.
         annealing_width: of the annealing net's pooled feature.
     """
