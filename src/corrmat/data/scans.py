@@ -38,16 +38,15 @@ def read_scan(path: Path, seed: int = 0) -> np.ndarray:
     reader = reader or (_scene if kind in MESHES else _text)
     try:
         points = reader(path, seed)
-        if points.ndim == 2 and points.shape[1] >= 3:
-            points = np.ascontiguousarray(points[:, :3], np.float64)
+        if points.ndim != 2 or points.shape[1] < 3:
+            raise CorrmatError(f"{path} holds an array of shape {points.shape}, not points (N, 3)")
+        points = np.ascontiguousarray(points[:, :3], np.float64)
     except CorrmatError:
         raise
     # Readers of damaged files fail in every way there is; each means the same to the user.
     except Exception as error:
         said = f"{type(error).__name__}: {error}".splitlines()[0]
         raise CorrmatError(f"{path} cannot be read as {kind[1:].upper()} ({said})") from error
-    if points.ndim != 2 or points.shape[1] < 3:
-        raise CorrmatError(f"{path} holds an array of shape {points.shape}, not points (N, 3)")
     if not len(points):
         raise CorrmatError(f"{path} holds no points")
     return points
