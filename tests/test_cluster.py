@@ -21,7 +21,8 @@ def kill_a_worker_after(checkpoint, killed):
     tick = threading.Event()
     while not checkpoint.exists():
         tick.wait(0.05)
-    found = subprocess.run(["pgrep", "-f", "ray::fit"], capture_output=True, text=True, check=True)
+    command = ["pgrep", "-f", "ray::1.1 DCP"]
+    found = subprocess.run(command, capture_output=True, text=True, check=True)
     os.kill(int(found.stdout.split()[0]), signal.SIGKILL)
     killed.append(found.stdout)
 

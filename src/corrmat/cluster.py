@@ -26,6 +26,7 @@ def train(configs: Sequence[Path], words: Sequence[str]) -> None:
     Raises:
         CorrmatError: Ray is missing, or an arm fails.
     """
+    os.environ.setdefault("RAY_DEDUP_LOGS", "0")  # lines of two arms may be alike
     try:
         import ray  # pyright: ignore[reportMissingImports] (an extra)
         from ray.exceptions import RayError  # pyright: ignore[reportMissingImports]
@@ -47,12 +48,11 @@ def train(configs: Sequence[Path], words: Sequence[str]) -> None:
     gpus = 1 if ray.cluster_resources().get("GPU") else 0
     task = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=RETRIES)(fit)
     common = [*words, "--runs", str(known.runs.absolute())]
-    left = {
-        task.remote(["fit", "--config", str(config.absolute()), "--arm", arm, *common]): (
-            f"{config.stem} {arm}"
-        )
-        for config, arm in arms
-    }
+    left = {}
+    for config, arm in arms:
+        name = f"{config.stem} {arm}"  # stands before every line that the arm prints
+        own = ["fit", "--config", str(config.absolute()), "--arm", arm]
+        left[task.options(name=name).remote([*own, *common])] = name
     while left:
         done, _ = ray.wait(list(left))
         name = left.pop(done[0])
