@@ -56,7 +56,7 @@ def test_the_command_prints_one_table_and_writes_a_record(pairs, tmp_path, capsy
     words = ["evaluate", "--models", "icp,corrmat", "--protocol", "clean", "--points", "256"]
     assert main([*words, "--pairs", "4", "--record", str(path)]) == 0
     shown = capsys.readouterr().out
-    for word in ("recall at 5°", "recall ADD-S", "ms a pair", "icp", "corrmat"):
+    for word in ("4 pairs", "recall at 5°", "recall ADD-S", "ms a pair", "icp", "corrmat"):
         assert word in shown
     record = json.loads(path.read_text())
     assert record["pairs"] == 4
@@ -70,6 +70,7 @@ def test_the_command_prints_one_table_and_writes_a_record(pairs, tmp_path, capsy
 def test_what_cannot_be_compared_is_said(pairs):
     with pytest.raises(CorrmatError, match="points = 2000"):
         comparison.frozen_pairs("real", points=2000)
+    assert comparison.frozen_pairs("paper", points=1500, count=1).target.shape[1] == 1500
     with pytest.raises(CorrmatError, match="needs its folder"):
         comparison.frozen_pairs("real", data="modelnet40")
     assert main(["evaluate", "--models", "nobody", "--points", "64", "--pairs", "1"]) == 2

@@ -280,6 +280,12 @@ def test_nothing_is_deleted_or_trained_when_the_test_split_cannot_be_read(tmp_pa
         ["--trainer.accumulate_grad_batches", "0"],
         ["--trainer.accumulate_grad_batches", "3"],  # validated after 4 batches
         ["--trainer.accumulate_grad_batches", "2"],  # the same, counted over epochs of 9
+        ["--trainer.max_steps", "0"],
+        ["--trainer.max_steps", "10"],  # of which a cycle rises in one
+        ["--trainer.limit_test_batches", "0"],
+        ["--trainer.val_check_interval", "10", "--trainer.check_val_every_n_epoch", "1"],
+        ["--trainer.devices", "5"],  # of 4 held-out shapes
+        ["--trainer.precision", "16-mixed"],  # cannot clip
     ):
         with pytest.raises(CorrmatError):
             experiment.run(load("1.1", *bad), tmp_path / "results", tmp_path / "runs")
@@ -380,12 +386,53 @@ def test_a_board_shows_every_arm(tmp_path):
     assert board.rows["DCP_corr"]["rotation error"].endswith("°")
 
 
+def test_a_board_of_a_run_that_ends_by_the_clock_knows_no_time_left(tmp_path):
+    console.listen(0)
+    board = console.Board(Console(file=io.StringIO(), force_terminal=True))
+    endless = ["--trainer.max_steps", "-1", "--trainer.max_time", "00:00:00:02"]
+    found = load("1.1", "--optimizer.schedule", "step", *endless)
+    with board:
+        train("DCP", found.settings["DCP"], tmp_path / "run", board=board)
+    assert int(board.rows["DCP"]["step"]) > 0
+
+
 def test_a_board_that_nobody_watches_draws_nothing(tmp_path):
     text = io.StringIO()
     with console.Board(Console(file=text)) as board:
         board.update("DCP", step="1/2")
     assert not board.watched
     assert text.getvalue() == ""
+
+
+@pytest.mark.parametrize("arm", ["1.1 DCP", "2.2 RPMNet_corr", "3.2 PCRNet"])
+def test_a_machine_that_is_fast_in_bfloat16_trains_in_it(arm, tmp_path, monkeypatch):
+    monkeypatch.setattr(experiment, "default_precision", lambda accelerator: "bf16-mixed")
+    seen = []
+    original = RegistrationModule.training_step
+
+    def noted(self, batch, batch_index):
+        seen.append((self.trainer.precision, torch.is_autocast_enabled("cpu")))
+        return original(self, batch, batch_index)
+
+    monkeypatch.setattr(RegistrationModule, "training_step", noted)
+    identity, name = arm.split()
+    found = load(identity, arms=[name])
+    assert found.settings[name].trainer.gradient_clip_val
+    ready = experiment.prepare(name, found.settings[name])
+    trained = experiment.train(ready, tmp_path / name)
+    assert set(seen) == {("bf16-mixed", True)}
+    assert math.isfinite(trained.curve[-1]["loss"])
+    (pairs,) = experiment.score(experiment.trained_module(ready, trained.checkpoint), ready)
+    assert pairs["rotation_error_deg"].isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("devices", "count", "one"),
+    [(4, 4, 1), ("auto", 0, 1), (-1, 0, 1), ("3", 3, 1), ([3, 1], 2, [3]), ("2,5", 2, [2])],
+)
+def test_a_test_runs_on_the_first_device_that_is_named(devices, count, one):
+    assert experiment._devices(devices) == count
+    assert experiment._first(devices) == one
 
 
 def test_checkpoints_reload_to_the_same_network(tmp_path):

@@ -88,6 +88,8 @@ def test_layers_lie_over_each_other(tmp_path):
     assert (dcp.optimizer.lr, corr.optimizer.lr) == (0.5, 0.1)
     assert dcp.network.width == corr.network.width == 64
     assert recipe.load(path, "laptop", []).settings["DCP"].data.num_points == 1000
+    path.write_text(path.read_text() + "paper:\nbands_deg:\nbaselines:\n")  # nothing named yet
+    assert recipe.load(path, "smoke", []).paper == {}
 
 
 @pytest.mark.parametrize(
@@ -100,6 +102,9 @@ def test_layers_lie_over_each_other(tmp_path):
         ("- 3\n", "holds no settings"),
         ("title: t\narms: {DCP: {}}\n", "lacks 'id'"),
         ("id: x\ntitle: t\narms: [DCP]\n", "arms must be names with settings"),
+        ("id: x\ntitle: t\narms: {DCP: 3}\n", "arms must be names with settings"),
+        ("id: x\ntitle: t\narms: {DCP: {}}\nbands_deg: 30\n", "bands_deg must be a list"),
+        ("id: x\ntitle: t\narms: {DCP: {}}\nscales: [laptop]\n", "scales must be names"),
         ("id: x\ntitle: t\n", "lacks 'arms'"),
         ("id: x\ntitle: t\nbase: nowhere.yaml\n", "no recipe .*nowhere.yaml"),
     ],

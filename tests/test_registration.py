@@ -122,6 +122,7 @@ LINE = np.arange(50.0)[:, None] * np.array([1.0, 2.0, 3.0])
         (LINE + 1e6, "all points lie on one line; the rotation is not determined"),
         (GRID[:, :2], r"array of shape \(64, 2\)"),
         (np.vstack([np.zeros((99, 3)), GRID - 1.5]), "most points are equal"),
+        (np.hstack([GRID, 255 * GRID]), "no unit normals .one has length 1.33e.03"),
     ],
 )
 def test_clouds_that_determine_nothing_are_refused(cloud, message):

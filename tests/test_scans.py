@@ -64,6 +64,18 @@ def test_an_xyz_file_may_begin_with_its_count_and_carry_more_columns(tmp_path):
     assert read_scan(path).tolist() == [[1, 2, 3], [4, 5, 6]]
 
 
+def test_a_table_may_begin_with_the_names_of_its_columns(tmp_path):
+    path = tmp_path / "cloud.csv"
+    path.write_text("x,y,z\n1,2,3\n4,5,6\n", "utf-8-sig")  # as spreadsheets write it
+    assert read_scan(path).tolist() == [[1, 2, 3], [4, 5, 6]]
+
+
+def test_an_array_that_lies_on_its_side_is_not_three_points(tmp_path):
+    np.save(tmp_path / "side.npy", POINTS.T)
+    with pytest.raises(CorrmatError, match="transpose it"):
+        read_scan(tmp_path / "side.npy")
+
+
 def test_a_ply_keeps_millimetres_at_ten_thousand_kilometres(tmp_path):
     far = POINTS + 1e7
     write_ply(tmp_path / "far.ply", far)
@@ -80,6 +92,7 @@ def test_a_ply_keeps_millimetres_at_ten_thousand_kilometres(tmp_path):
         ("empty.xyz", b"\n\n", "holds no points"),
         ("words.txt", b"one two three\n", "cannot be read as TXT"),
         ("short.txt", b"1 2 3\n4 5\n", "row 2 holds 2 numbers"),
+        ("words.csv", b"x,y\nz,u\n", "row 1 holds 2 numbers"),
         ("noise.npy", b"\x93NUMPY nonsense", "cannot be read as NPY"),
         ("noise.stl", b"solid nothing", "holds no points"),
         ("noise.pcd", b"VERSION .7\n", "cannot be read as PCD"),

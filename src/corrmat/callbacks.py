@@ -14,7 +14,10 @@ import lightning as L
 import torch
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.plugins.io import TorchCheckpointIO
+from lightning.pytorch.plugins.precision import MixedPrecision, Precision
+from lightning.pytorch.utilities import GradClipAlgorithmType
 from torch import Tensor
+from torch.optim import Optimizer
 
 from corrmat.files import replace_bytes
 from corrmat.types import PairBatch
@@ -129,6 +132,26 @@ class WholeCheckpoints(TorchCheckpointIO):
         torch.save(checkpoint, content)
         Path(path).parent.mkdir(parents=True, exist_ok=True)
         replace_bytes(Path(path), content.getbuffer())
+
+
+class Bfloat16(MixedPrecision):
+    """Autocast to bfloat16 whose gradients can be clipped though the optimizer is fused.
+
+    Lightning refuses this for every mixed precision, because a fused step may have to undo a
+    scale first; bfloat16 gradients have none.
+    """
+
+    def __init__(self, device: str) -> None:
+        super().__init__("bf16-mixed", device)
+
+    def clip_gradients(
+        self,
+        optimizer: Optimizer,
+        clip_val: float = 0.0,
+        gradient_clip_algorithm: GradClipAlgorithmType = GradClipAlgorithmType.NORM,
+    ) -> None:
+        """As in full precision."""
+        Precision.clip_gradients(self, optimizer, clip_val, gradient_clip_algorithm)
 
 
 class SaveOnInterrupt(Callback):

@@ -390,6 +390,7 @@ def _compare(known: argparse.Namespace) -> int:
         ensure_writable(record.parent)
     pairs = comparison.frozen_pairs(**how, root=root, count=count)
     found = comparison.compare(pairs, known.models.split(","))
+    print(f"{len(pairs)} pairs")
     print(comparison.table(found))
     if record is not None:
         comparison.write(record, found, **how, pairs=len(pairs))
@@ -469,11 +470,12 @@ def _report(results: Path, output: Path | None, docs: Path | None) -> int:
         raise CorrmatError(f"no records in {results}; run an experiment first")
     if output is not None:
         from corrmat import page
+        from corrmat.files import replace_text
 
         if not output.parent.is_dir():
             raise CorrmatError(f"no folder {output.parent} to write into")
         content = page.build(results)
-        output.write_text(content)
+        replace_text(output, content)
         print(f"{output}: {len(content) / 1e6:.1f} MB, open it in a browser")
     if docs is not None:
         from corrmat import record

@@ -71,13 +71,15 @@ def frozen_pairs(
         CorrmatError: there are no such data, or not so many points.
     """
     clouds = _clouds(data, root, "test" if split == "test" else "train")
-    if 2 * points > clouds.rows.shape[1]:
-        raise CorrmatError(f"points = {points}: two clouds of them need more than there are")
+    how = replace(PROTOCOLS[protocol], num_points=points)
+    known, needed = clouds.rows.shape[1], points * (2 if how.sampling == "disjoint" else 1)
+    if needed > known:
+        raise CorrmatError(
+            f"points = {points}: {protocol} pairs need shapes of {needed} points, not {known}"
+        )
     chosen = np.linspace(0, len(clouds) - 1, min(count, len(clouds))).round().astype(int)
     keys = [Key(0, STREAM[split], 0, int(index)) for index in chosen]
-    return make_pairs(
-        clouds, chosen.tolist(), keys, replace(PROTOCOLS[protocol], num_points=points)
-    )
+    return make_pairs(clouds, chosen.tolist(), keys, how)
 
 
 def compare(pairs: PairBatch, models: Sequence[str], refine: Refine = "icp") -> dict[str, Any]:
@@ -128,12 +130,13 @@ def write(path: Path, models: dict[str, Any], **about: Any) -> None:  # noqa: AN
 
 def table(models: dict[str, Any]) -> str:
     """Models and columns as plain text."""
-    lines = [" " * 12 + "".join(f"{head:>14s}" for head in COLUMNS.values())]
+    width = max(map(len, models))
+    lines = [" " * width + "".join(f"{head:>14s}" for head in COLUMNS.values())]
     for name, found in models.items():
         cells = [
             f"{found[c]:14.1%}" if c.startswith("recall") else f"{found[c]:14.2f}" for c in COLUMNS
         ]
-        lines.append(f"{name[-12:]:12s}" + "".join(cells))
+        lines.append(f"{name:{width}s}" + "".join(cells))
     return "\n".join(lines)
 
 

@@ -1,6 +1,7 @@
 """What a run shows while it works: a live table on a terminal, plain lines elsewhere."""
 
 import logging
+import math
 import time
 from types import TracebackType
 from typing import Self
@@ -118,16 +119,17 @@ class Progress(Callback):
             return
         began, pairs, steps = self._began
         seconds = max(time.monotonic() - began, 1e-9)
-        step, total = trainer.global_step, int(trainer.estimated_stepping_batches)
+        step, total = trainer.global_step, trainer.estimated_stepping_batches
+        known = math.isfinite(total)  # a run may end by the clock alone
         left = seconds / max(step - steps, 1) * (total - step)
         values = trainer.callback_metrics
         self.board.update(
             self.arm,
-            step=f"{step}/{total}",
+            step=f"{step}/{total:.0f}" if known else str(step),
             epoch=str(trainer.current_epoch),
             **{"pairs/s": f"{(self.curve.pairs - pairs) / seconds:.0f}"},
             loss=f"{float(values['train/loss']):.4f}",
-            time_left=clock(left),
+            time_left=clock(left) if known else "",
             matches=f"{float(values['train/matches']):.1%}" if "train/matches" in values else "",
         )
 

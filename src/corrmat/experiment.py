@@ -25,7 +25,7 @@ from torch import Tensor
 
 from corrmat import logs, record, report
 from corrmat.baselines import BASELINES, UNTRAINED
-from corrmat.callbacks import Curve, SaveOnInterrupt, WholeCheckpoints, say
+from corrmat.callbacks import Bfloat16, Curve, SaveOnInterrupt, WholeCheckpoints, say
 from corrmat.console import Board, Progress
 from corrmat.data.datamodule import PairDataset, RegistrationDataModule
 from corrmat.errors import CorrmatError
@@ -81,6 +81,7 @@ def prepare(name: str, settings: Settings) -> Arm:
         )
     arm.datamodule.setup()
     _refuse_schedules(arm)
+    _refuse_validation(arm)
     _try(module, arm)
     try:
         L.Trainer(**trainer_options(settings), logger=False)
@@ -91,20 +92,55 @@ def prepare(name: str, settings: Settings) -> Arm:
 
 
 def _refuse_schedules(arm: Arm) -> None:
-    """A rate that never ends; checkpoints, written after validation, in the middle of a step."""
-    trainer = arm.settings.trainer
+    """A rate that never ends or never rises; no step at all; gradients that cannot be clipped."""
+    trainer, rate = arm.settings.trainer, arm.settings.optimizer
+    if trainer.accumulate_grad_batches < 1:
+        raise CorrmatError(
+            f"--trainer.accumulate_grad_batches {trainer.accumulate_grad_batches} is not positive"
+        )
+    for name in ("max_steps", "max_epochs", "limit_train_batches", "limit_test_batches"):
+        if getattr(trainer, name) == 0:
+            raise CorrmatError(f"--trainer.{name} 0 leaves nothing to do")
     timed = trainer.max_time is not None and trainer.max_epochs is None
     endless = trainer.max_steps == -1 and (trainer.max_epochs == -1 or timed)
-    if endless and arm.settings.optimizer.schedule == "onecycle":
-        raise CorrmatError("a one-cycle learning rate needs --trainer.max_steps or max_epochs")
+    if rate.schedule == "onecycle":
+        if endless:
+            raise CorrmatError("a one-cycle learning rate needs --trainer.max_steps or max_epochs")
+        if trainer.max_steps * rate.warmup == 1:  # torch divides by the steps after the first
+            raise CorrmatError(
+                f"a one-cycle learning rate cannot rise in one step, {rate.warmup:g} of "
+                f"--trainer.max_steps {trainer.max_steps}: change either"
+            )
+    if trainer.gradient_clip_val and str(trainer.precision) in ("16", "16-mixed"):
+        raise CorrmatError(
+            f"--trainer.precision {trainer.precision} cannot clip gradients: take bf16-mixed, or "
+            "--trainer.gradient_clip_val null"
+        )
+
+
+def _refuse_validation(arm: Arm) -> None:
+    """Validation that never comes; checkpoints, written after it, in the middle of a step."""
+    trainer, data = arm.settings.trainer, arm.datamodule
+    processes, held_out = _devices(trainer.devices) * trainer.num_nodes, len(data.clouds("val"))
+    if processes > held_out:
+        raise CorrmatError(
+            f"{processes} processes cannot share {held_out} held-out shapes: lower "
+            "--trainer.devices, or raise --data.train_shapes"
+        )
     together, interval = trainer.accumulate_grad_batches, trainer.val_check_interval
-    if together < 1:
-        raise CorrmatError(f"--trainer.accumulate_grad_batches {together} is not positive")
+    batches = len(data.train_dataloader())
+    if trainer.check_val_every_n_epoch is not None and isinstance(interval, int | float):
+        least = interval if isinstance(interval, int) else 1 / interval
+        if least > batches:
+            raise CorrmatError(
+                f"--trainer.val_check_interval {interval} never comes in epochs of {batches} "
+                "batches; --trainer.check_val_every_n_epoch null counts over epochs"
+            )
     if together == 1 or interval is None or (isinstance(interval, float) and interval == 1):
         return  # validated after steps, or whole epochs
     between = [interval]
     if trainer.check_val_every_n_epoch is None:  # batches are counted over epochs
-        between.append(len(arm.datamodule.train_dataloader()))
+        between.append(batches)
     if any(number % together for number in between):
         raise CorrmatError(
             f"with --trainer.accumulate_grad_batches {together}, validation after {interval} "
@@ -262,7 +298,6 @@ def train(
     config = report.plain(settings.as_dict())
     made = logs.loggers(logger, folder, arm.name, group, config)
     options = trainer_options(settings)
-    options["precision"] = _precision(settings)
     keep_freed_memory()
     trainer = L.Trainer(**options, logger=made, callbacks=callbacks, default_root_dir=folder)
     datamodule.trainer = trainer
@@ -328,9 +363,10 @@ def score(
     Returns:
         Per-pair values of each set.
     """
-    alone = {"devices": 1, "num_nodes": 1, "strategy": "auto", "precision": "32-true"}
+    options = trainer_options(arm.settings, "32-true")
+    alone = {"devices": _first(options["devices"]), "num_nodes": 1, "strategy": "auto"}
     quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
-    trainer = L.Trainer(**{**trainer_options(arm.settings), **alone, **quiet})
+    trainer = L.Trainer(**{**options, **alone, **quiet})
     found = []
     for changes in how:
         trainer.test(module, arm.datamodule.test_dataloader(**changes), verbose=False)
@@ -339,6 +375,27 @@ def score(
         found[-1]["category"] = torch.from_numpy(names.labels)[found[-1]["shape"]]
         module.metrics.reset()
     return found
+
+
+def _first(devices: int | str | list[int]) -> int | list[int]:
+    """One device: the first of those that settings name, or any."""
+    named = _named(devices)
+    return named[:1] if isinstance(named, list) else 1
+
+
+def _devices(devices: int | str | list[int]) -> int:
+    """How many devices settings ask for; 0 where that is left to Lightning."""
+    named = _named(devices)
+    if isinstance(named, list):
+        return len(named)
+    return max(0, int(named)) if str(named).lstrip("-").isdigit() else 0
+
+
+def _named(devices: int | str | list[int]) -> int | str | list[int]:
+    """Devices as Lightning takes them: "2,3" names two, as a list does."""
+    if isinstance(devices, str) and "," in devices:
+        return [int(name) for name in devices.split(",") if name.strip()]
+    return devices
 
 
 def _tested(
@@ -439,8 +496,8 @@ def quieten() -> None:
         warnings.filterwarnings("ignore", message=f".*{message}")
 
 
-def trainer_options(settings: Settings) -> dict[str, Any]:
-    """Keyword arguments of Lightning's Trainer."""
+def trainer_options(settings: Settings, precision: str | None = None) -> dict[str, Any]:
+    """Keyword arguments of Lightning's Trainer; the settings' precision, or another."""
     options = settings.trainer.as_dict()
     options |= {"enable_model_summary": False, "enable_checkpointing": True}
     options["use_distributed_sampler"] = False  # `EpochSampler` shares the pairs out
@@ -448,7 +505,15 @@ def trainer_options(settings: Settings) -> dict[str, Any]:
     options["enable_progress_bar"] = bool(options.get("enable_progress_bar"))  # ours is the board
     if options["accelerator"] == "auto" and torch.backends.mps.is_available():
         options["accelerator"] = "cpu"  # Apple's GPUs lack the float64 that Procrustes needs
+    options["precision"] = precision or _precision(settings)
+    if options["precision"] == "bf16-mixed" and "fsdp" not in str(options["strategy"]):
+        options["precision"] = None  # the plugin's
+        options["plugins"].append(Bfloat16("cuda" if _on_gpu(options["accelerator"]) else "cpu"))
     return options
+
+
+def _on_gpu(accelerator: str) -> bool:
+    return torch.cuda.is_available() and accelerator in ("auto", "gpu", "cuda")
 
 
 def _precision(settings: Settings) -> str:
@@ -463,7 +528,7 @@ def default_precision(accelerator: str) -> str:
     Args:
         accelerator: as Lightning's Trainer takes it.
     """
-    if torch.cuda.is_available() and accelerator in ("auto", "gpu", "cuda"):
+    if _on_gpu(accelerator):
         fast = torch.cuda.is_bf16_supported(including_emulation=False)
     else:
         fast = getattr(torch.cpu, "get_capabilities", dict)().get("avx512_bf16", False)

@@ -1,5 +1,6 @@
 """Figures of a record: the paper's curves, and what was matched with what."""
 
+import io
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,6 +10,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter, NullFormatter
 
+from corrmat.files import replace_bytes
 from corrmat.report import METRICS, family, value_of
 
 # The columns of the paper's figures 5, 6 and 7: what a curve shows, by the arms' family.
@@ -136,7 +138,7 @@ def curves_figure(record: Mapping[str, Any], path: Path) -> None:
         axes.grid(alpha=0.3)
     lines = {line.get_label(): line for axes in figure.axes for line in axes.lines}
     figure.legend(handles=list(lines.values()), loc="outside lower center", ncols=4)
-    figure.savefig(path, dpi=110, metadata={"Software": None})
+    save(figure, path)
 
 
 def matches_figure(view: Mapping[str, Any], title: str, path: Path) -> None:
@@ -183,7 +185,7 @@ def matches_figure(view: Mapping[str, Any], title: str, path: Path) -> None:
         axes.set(title=heading, aspect="equal")
         axes.set_axis_off()
     both[1].legend(fontsize="x-small", loc="best")
-    figure.savefig(path, dpi=110, metadata={"Software": None})
+    save(figure, path)
 
 
 def _seen(points: np.ndarray) -> np.ndarray:
@@ -196,3 +198,10 @@ def _seen(points: np.ndarray) -> np.ndarray:
 
 def _box(*clouds: np.ndarray) -> Sequence[float]:
     return np.ptp(np.concatenate(clouds), 0).clip(1e-3)
+
+
+def save(figure: Figure, path: Path, dpi: int = 110) -> None:
+    """Write a PNG beside its place, then move it in; the same bytes for the same figure."""
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=dpi, metadata={"Software": None})
+    replace_bytes(path, content.getbuffer())

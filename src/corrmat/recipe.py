@@ -104,8 +104,12 @@ def load(path: Path, scale: str, options: list[str], arms: list[str] | None = No
     for key in ("id", "title", "arms"):
         if key not in merged:
             raise CorrmatError(f"{path} lacks {key!r}")
-    if not isinstance(merged["arms"], dict):
+    arms_known = merged["arms"]
+    if not isinstance(arms_known, dict) or not all(_is_mapping(own) for own in arms_known.values()):
         raise CorrmatError(f"{path}: arms must be names with settings, e.g. arms: {{DCP: {{}}}}")
+    for key in ("bands_deg", "sweep_outliers", "baselines"):
+        if not isinstance(merged.get(key) or [], list):
+            raise CorrmatError(f"{path}: {key} must be a list, e.g. {key}: [...]")
     chosen = merged["arms"] if arms is None else {a: merged["arms"].get(a) for a in arms}
     settings = {}
     for arm, own in chosen.items():
@@ -121,12 +125,12 @@ def load(path: Path, scale: str, options: list[str], arms: list[str] | None = No
         id=str(merged["id"]),
         title=merged["title"],
         scale=scale,
-        paper=merged.get("paper", {}),
+        paper=merged.get("paper") or {},
         settings=settings,
-        bands_deg=tuple(merged.get("bands_deg", ())),
-        sweep_outliers=tuple(merged.get("sweep_outliers", ())),
+        bands_deg=tuple(merged.get("bands_deg") or ()),
+        sweep_outliers=tuple(merged.get("sweep_outliers") or ()),
         networks_of=str(merged["networks_of"]) if "networks_of" in merged else None,
-        baselines=_known_baselines(merged.get("baselines", ()), path),
+        baselines=_known_baselines(merged.get("baselines") or (), path),
         test_pairs=_checksum(merged, scale, settings, options),
     )
 
@@ -196,10 +200,16 @@ def _first_line(error: Exception) -> str:
 
 def _scale(recipe: dict[str, Any], scale: str) -> dict[str, Any]:
     scales = recipe.get("scales") or {}
+    if not isinstance(scales, dict) or not all(_is_mapping(own) for own in scales.values()):
+        raise CorrmatError("scales must be names with settings, e.g. scales: {laptop: {}}")
     for name in scales:
         if name not in SCALES:
             raise CorrmatError(f"unknown scale {name!r}; known: {', '.join(SCALES)}")
     return scales.get(scale) or {}
+
+
+def _is_mapping(value: object) -> bool:
+    return value is None or isinstance(value, dict)
 
 
 def _read(path: Path) -> dict[str, Any]:

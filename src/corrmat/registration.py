@@ -22,6 +22,7 @@ CHOICE = 2048  # that its guesses are compared on
 FULL = 20_000  # that the best guess is refined on
 MEDIAN = 0.6  # what the median distance from the centroid is scaled to: a radius of about one
 TRUST = 0.5  # confidence from where on the verdict is "aligned"
+LONGEST_NORMAL = 1.01  # given ones are units, or zero
 _FLAT = 1e-6  # thinner than this against its length, a cloud is a line
 
 
@@ -147,6 +148,12 @@ class Cloud:
         if len(bad):
             raise CorrmatError(
                 f"{name}: {len(bad)} points are NaN or infinite, the first is row {bad[0]}"
+            )
+        longest = np.linalg.norm(values[:, 3:], axis=1).max(initial=0)
+        if longest > LONGEST_NORMAL:
+            raise CorrmatError(
+                f"{name}: columns 4 to 6 are no unit normals (one has length {longest:.3g}); pass "
+                "the points alone, (N, 3), and normals are estimated"
             )
         rank = _hash(values, seed)
         few = np.argpartition(rank, FULL)[:FULL] if len(rank) > FULL else np.arange(len(rank))

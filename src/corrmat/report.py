@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from corrmat.errors import CorrmatError
+from corrmat.files import replace_text
 
 # metric -> (heading, format, factor); the sound ones first, then the paper's.
 METRICS: dict[str, tuple[str, str, float]] = {
@@ -264,7 +265,7 @@ def refresh(path: Path, name: str, content: str) -> None:
         raise CorrmatError(f"{path} has no {start} ... {end} to write into")
     before, rest = text.split(start, 1)
     after = rest.split(end, 1)[1]
-    path.write_text(f"{before}{start}\n{content}\n{end}{after}")
+    replace_text(path, f"{before}{start}\n{content}\n{end}{after}")
 
 
 def plain(value: Any) -> Any:  # noqa: ANN401

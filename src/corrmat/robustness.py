@@ -17,6 +17,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from corrmat.data.pairs import Key, generator
+from corrmat.figures import save
 from corrmat.files import replace_text
 from corrmat.metrics import rotation_error_deg
 from corrmat.ops.rigid import axis_angle_to_matrix, procrustes
@@ -168,7 +169,7 @@ def figure(found: dict[str, Any], path: Path) -> None:
         axes.set(xlabel="per cent corrupted", ylabel="rotation error, deg")
         axes.grid(alpha=0.3)
         axes.legend(fontsize="small")
-    canvas.savefig(path, dpi=110, metadata={"Software": None})
+    save(canvas, path)
 
 
 def terminal_table(found: dict[str, Any]) -> str:

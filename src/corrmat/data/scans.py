@@ -40,6 +40,10 @@ def read_scan(path: Path, seed: int = 0) -> np.ndarray:
         points = reader(path, seed)
         if points.ndim != 2 or points.shape[1] < 3:
             raise CorrmatError(f"{path} holds an array of shape {points.shape}, not points (N, 3)")
+        if len(points) == 3 < points.shape[1]:
+            raise CorrmatError(
+                f"{path} holds an array of shape {points.shape}: transpose it to (N, 3)"
+            )
         points = np.ascontiguousarray(points[:, :3], np.float64)
     except CorrmatError:
         raise
@@ -103,11 +107,21 @@ def _numpy(path: Path, seed: int) -> np.ndarray:
 
 
 def _text(path: Path, seed: int) -> np.ndarray:
-    lines = path.read_text().replace(",", " ").splitlines()
+    lines = path.read_text("utf-8-sig").replace(",", " ").splitlines()
     rows = [line.split() for line in lines if line.strip() and not line.lstrip().startswith("#")]
     if rows and len(rows[0]) == 1 and rows[0][0].isdigit():  # an XYZ file's count of points
+        rows = rows[1:]
+    if len(rows) > 1 and not any(map(_is_number, rows[0])):  # the columns' names
         rows = rows[1:]
     short = next((i for i, row in enumerate(rows) if len(row) < 3), None)
     if short is not None:
         raise CorrmatError(f"{path}: row {short + 1} holds {len(rows[short])} numbers, not 3")
     return np.array([row[:3] for row in rows], np.float64).reshape(-1, 3)
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True

@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from corrmat.data.clouds import CloudSet
+from corrmat.figures import save
 
 
 def draw(clouds: CloudSet, path: Path, columns: int = 8) -> None:
@@ -27,4 +28,4 @@ def draw(clouds: CloudSet, path: Path, columns: int = 8) -> None:
         axes.set_axis_off()
         axes.set_title(name, fontsize=9, y=0.92)
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=80, metadata={"Software": None})
+    save(figure, path, dpi=80)
