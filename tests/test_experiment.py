@@ -462,3 +462,12 @@ def test_a_record_is_json_that_everybody_can_read(tmp_path, monkeypatch):
 
     record = json.loads(text, parse_constant=refuse)
     assert record["arms"]["DCP"]["chamfer"] is None
+
+
+def test_a_record_says_what_its_arms_were_trained_on(tmp_path, monkeypatch):
+    monkeypatch.setattr(experiment, "default_precision", lambda accelerator: "bf16-mixed")
+    steps = ["--trainer.max_steps", "2"]
+    hardware = experiment.run(load("3.2", *steps), tmp_path / "results", tmp_path / "r")["hardware"]
+    assert hardware["precision"] == "bf16-mixed / 32-true"  # PCRNet_corr: see pcrnet.yaml
+    assert hardware["threads"] == torch.get_num_threads()
+    assert hardware["gpu"] == torch.cuda.is_available()

@@ -51,6 +51,7 @@ class Trained:
     train_seconds: float
     commit: str | None
     curve: list[dict[str, float]] = field(default_factory=list)
+    hardware: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass
@@ -194,7 +195,7 @@ def run(
             "the test pairs made here (%s) are not the recipe's (%s): numbers compare with other "
             "records in the mean only", test_pairs, recipe.test_pairs,
         )  # fmt: skip
-    scores, rows, views = {}, [], []
+    scores, rows, views, hardware = {}, [], [], []
     with Board() as board:
         for arm in ready:
             say(f"\n{recipe.id} {arm.name} ({recipe.scale}, {recipe.data})")
@@ -211,6 +212,7 @@ def run(
                 "trained_at": trained.commit,
                 "curve": trained.curve,
             }
+            hardware.append(trained.hardware)
             rows += record.rows(arm.name, tests)
             views = views or _views(module, arm, tests, recipe)
     if not first_process():
@@ -226,11 +228,7 @@ def run(
         "data": recipe.data,
         "seed": ready[0].settings.seed,
         "commit": record.commit(),
-        "hardware": {
-            "threads": torch.get_num_threads(),
-            "gpu": torch.cuda.is_available(),
-            "precision": _precision(ready[0].settings),
-        },
+        "hardware": _together(hardware),
         "versions": {name: version(name) for name in ("corrmat", "torch", "lightning", "numpy")},
         "test_pairs": test_pairs,
         "bands_deg": list(recipe.bands_deg),
@@ -316,7 +314,14 @@ def train(
     if not checkpoint.is_file():
         say("training ended before the first validation: the last weights stand for the best")
         trainer.save_checkpoint(checkpoint)
-    trained = Trained(checkpoint, curve.pairs, curve.seconds, record.commit(), curve.points)
+    hardware = {
+        "threads": torch.get_num_threads(),
+        "gpu": _on_gpu(settings.trainer.accelerator),
+        "precision": _precision(settings),
+    }
+    trained = Trained(
+        checkpoint, curve.pairs, curve.seconds, record.commit(), curve.points, hardware
+    )
     if first_process():
         replace_text(
             done, json.dumps(asdict(trained) | {"checkpoint": trained.checkpoint.name}, indent=1)
@@ -324,6 +329,15 @@ def train(
     if interrupt.noted:
         raise KeyboardInterrupt
     return trained
+
+
+def _together(arms: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """What all arms were trained on; "a / b" where one differs from another."""
+    found = {}
+    for key in arms[0]:
+        values = list(dict.fromkeys(arm.get(key) for arm in arms))
+        found[key] = values[0] if len(values) == 1 else " / ".join(map(str, values))
+    return found
 
 
 def first_process() -> bool:
