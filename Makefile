@@ -2,6 +2,7 @@
 SCALE ?= laptop
 DATA  ?= shapes
 ROOT  ?=
+NAME  ?=
 ARGS  ?=
 LAUNCHER ?=
 PYTHON ?= python3
@@ -11,14 +12,14 @@ export PYTHONUNBUFFERED := 1
 unexport PYTHONDONTWRITEBYTECODE  # without byte code every command takes seconds longer
 BIN := .venv/bin
 EXPERIMENTS := exp1.1 exp1.2 exp1.3 exp1.4 exp2.1 exp2.2 exp2.3 exp2.4 exp3.1 exp3.2 exp3.3
-OPTIONS = --scale $(SCALE) --data.data $(DATA) $(if $(ROOT),--data.root "$(ROOT)")
+OPTIONS = --scale $(SCALE) --data.data $(DATA) $(if $(ROOT),--data.root "$(ROOT)") $(if $(NAME),--data.name "$(NAME)")
 # What a cluster has trained anew is not trained a second time to be tested.
 RUN_OPTIONS = $(OPTIONS) $(if $(filter ray,$(LAUNCHER)),$(filter-out --fresh,$(ARGS)),$(ARGS))
 
 .PHONY: help $(EXPERIMENTS) outliers robustness all on-ray weights protocols docs report bench lint format test test-slow test-oldest lock clean
 
 help:  ## list the targets
-	@echo "make TARGET [SCALE=smoke|laptop|paper] [DATA=shapes|modelnet40] [ROOT=folder] [ARGS='--key value']"
+	@echo "make TARGET [SCALE=smoke|laptop|paper] [DATA=shapes|modelnet40|folder] [ROOT=folder] [NAME=chairs] [ARGS='--key value']"
 	@grep -hE '^[a-z$$()_A-Z0-9.-]+:.*##' $(MAKEFILE_LIST) | sed 's/\$$(EXPERIMENTS)/exp1.1 ... exp3.3/; s/:.*##/\t/' | expand -t 22
 
 $(EXPERIMENTS): exp%: .venv/ready  ## train both arms of an experiment, print ours beside the paper's
@@ -51,8 +52,8 @@ report: .venv/ready  ## report.html: every record on one page
 bench: .venv/ready  ## speed: pairs a second, training steps, ratios against a naive twin
 	$(BIN)/python benchmarks/bench.py
 
-lint: .venv/ready  ## ruff and pyright
-	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/pyright
+lint: .venv/ready  ## ruff, pyright, and the layers that imports keep to
+	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/pyright && $(BIN)/lint-imports
 
 format: .venv/ready  ## let ruff rewrite what it can
 	$(BIN)/ruff check --fix . && $(BIN)/ruff format .
@@ -70,7 +71,7 @@ test-oldest: .venv/ready  ## make test on the oldest versions that pyproject.tom
 
 lock: .venv/ready  ## compile requirements.lock anew from pyproject.toml
 	$(BIN)/uv pip compile pyproject.toml --extra dev --universal --python-version 3.11 \
-		--generate-hashes --no-header --quiet --upgrade --output-file requirements.lock
+		--generate-hashes --no-header --quiet --upgrade --no-emit-index-url --output-file requirements.lock
 
 clean:  ## remove the environment and all runs (results/ stays)
 	rm -rf .venv .venv-oldest runs

@@ -32,12 +32,13 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 
 import twins  # noqa: E402  # pyright: ignore[reportMissingImports]
-
 from corrmat.aligners import CLASSICAL  # noqa: E402
+from corrmat.experiment import keep_freed_memory, make_module, prepare  # noqa: E402
+from corrmat.recipe import load as load_recipe  # noqa: E402
+
 from corrmat.data import shapes  # noqa: E402
 from corrmat.data.pairs import Key, PairSettings, make_pairs  # noqa: E402
 from corrmat.errors import CorrmatError  # noqa: E402
-from corrmat.experiment import keep_freed_memory, make_module, prepare  # noqa: E402
 from corrmat.losses import chamfer_loss, correspondence_loss  # noqa: E402
 from corrmat.methods import METHODS  # noqa: E402
 from corrmat.networks.dcp import DCPNetwork  # noqa: E402
@@ -46,7 +47,6 @@ from corrmat.ops import streaming  # noqa: E402
 from corrmat.ops.correspondence import SinkhornCorrespondence, SoftCorrespondence  # noqa: E402
 from corrmat.ops.neighbors import within_radius  # noqa: E402
 from corrmat.ops.rigid import procrustes  # noqa: E402
-from corrmat.recipe import load as load_recipe  # noqa: E402
 from corrmat.types import PairBatch  # noqa: E402
 
 Row = dict[str, Any]

@@ -11,8 +11,9 @@ import itertools
 import json
 from pathlib import Path
 
-from corrmat import aligners, comparison
 from corrmat.aligners import ClassicalSettings
+
+from corrmat import aligners, comparison
 
 RESULTS = Path(__file__).resolve().parents[1] / "results" / "register" / "tuning.json"
 PAIRS = 60

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from corrmat import console
+from corrmat.training import console
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = Path(os.environ.get("CORRMAT_SHARED", ROOT.parent / "shared"))
@@ -38,7 +38,7 @@ def state_of(arrays: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
 def _quiet_and_offline(monkeypatch, tmp_path):
     monkeypatch.setenv("WANDB_MODE", "disabled")
     monkeypatch.setenv("CORRMAT_CACHE", str(tmp_path / "cache"))
-    console.listen(0)
+    console.print_messages(0)
 
 
 @pytest.fixture

@@ -5,13 +5,14 @@ import shutil
 import signal
 import subprocess
 import threading
+from pathlib import Path
 
 import pytest
 from conftest import ROOT
 from test_experiment import load, numbers
 
-from corrmat import cluster, experiment
 from corrmat.errors import CorrmatError
+from corrmat.training import cluster, experiment, recipe
 
 CONFIGS = [ROOT / "configs/exp" / f"{name}.yaml" for name in ("1.1", "1.4")]
 
@@ -22,9 +23,9 @@ def kill_a_worker_after(checkpoint, killed):
     while not checkpoint.exists():
         tick.wait(0.05)
     command = ["pgrep", "-f", "ray::1.1 DCP"]
-    found = subprocess.run(command, capture_output=True, text=True, check=True)
-    os.kill(int(found.stdout.split()[0]), signal.SIGKILL)
-    killed.append(found.stdout)
+    listed = subprocess.run(command, capture_output=True, text=True, check=True)
+    os.kill(int(listed.stdout.split()[0]), signal.SIGKILL)
+    killed.append(listed.stdout)
 
 
 @pytest.mark.slow
@@ -40,9 +41,8 @@ def test_arms_trained_by_two_workers_one_of_them_killed_give_the_same_record(tmp
     killer = threading.Thread(target=kill_a_worker_after, args=(checkpoint, killed), daemon=True)
     killer.start()
     try:
-        options = ["--scale", "smoke", "--runs", str(tmp_path / "runs"), "--logger", "none"]
-        quiet = ["--trainer.enable_progress_bar", "false"]
-        cluster.train(CONFIGS, [*options, *quiet, *steps])
+        overrides = recipe.parse_overrides(["--trainer.enable_progress_bar", "false", *steps])
+        cluster.train_all(CONFIGS, "smoke", overrides, tmp_path / "runs", "none")
     finally:
         ray.shutdown()
     killer.join(timeout=1)
@@ -59,4 +59,4 @@ def test_arms_trained_by_two_workers_one_of_them_killed_give_the_same_record(tmp
 def test_without_ray_one_line_says_what_to_install(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "ray", None)
     with pytest.raises(CorrmatError, match=r"pip install ray"):
-        cluster.train(CONFIGS, ["--scale", "smoke"])
+        cluster.train_all(CONFIGS, "smoke", {}, Path("runs"))

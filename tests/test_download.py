@@ -218,9 +218,9 @@ def test_links_damage_and_other_archives_are_refused(tmp_path):
         unzip(path, tmp_path, "set")
     whole = archive(tmp_path / "b.zip", {"set/in.txt": CONTENT.hex()}).read_bytes()
     for at in (60, 1000, len(whole) // 2, -30):  # of its member's packed bytes, of its directory
-        spoilt = bytearray(whole)
-        spoilt[at : at + 4] = bytes(255 - byte for byte in spoilt[at : at + 4])
-        (tmp_path / "b.zip").write_bytes(spoilt)
+        corrupted = bytearray(whole)
+        corrupted[at : at + 4] = bytes(255 - byte for byte in corrupted[at : at + 4])
+        (tmp_path / "b.zip").write_bytes(corrupted)
         with pytest.raises(CorrmatError, match="damaged|no whole zip|leads out|does not hold"):
             unzip(tmp_path / "b.zip", tmp_path, "set")
     named = archive(tmp_path / "b.zip", {"set/ä.txt": "in"}).read_bytes()
@@ -256,8 +256,8 @@ def test_the_command_fetches_unpacks_and_reads_modelnet40(server, tmp_path, caps
     root = tmp_path / "root"
     words = ["data", "modelnet40", "--root", str(root), "--mirror", server.url]
     assert main(words) == 0
-    assert "whole and readable" in capsys.readouterr().out
-    assert len(modelnet40.load(root, "test")) == 2
+    assert "complete; use it with" in capsys.readouterr().out
+    assert len(modelnet40.load("test", root=root)) == 2
     asked = len(server.ranges)
     assert main(words) == 0  # it is there
     assert len(server.ranges) == asked

@@ -14,22 +14,27 @@ import pytest
 import torch
 from conftest import ROOT, shared
 from rich.console import Console
+from scipy.spatial.transform import Rotation
 
-from corrmat import console, experiment, page, recipe
 from corrmat.errors import CorrmatError
 from corrmat.metrics import rotation_error_deg
 from corrmat.module import RegistrationModule
+from corrmat.reporting.page import build_page
+from corrmat.reporting.record import Record, read_snapshots
+from corrmat.training import console, experiment, fit, hardware, recipe
+from corrmat.training.preflight import prepare
 
 IDS = [path.stem for path in sorted((ROOT / "configs" / "exp").glob("*.yaml"))]
 
 
 def load(identity, *options, arms=None):
     path = ROOT / "configs" / "exp" / f"{identity}.yaml"
-    return recipe.load(path, "smoke", ["--trainer.enable_progress_bar", "false", *options], arms)
+    words = ["--trainer.enable_progress_bar", "false", *options]
+    return recipe.load(path, "smoke", recipe.parse_overrides(words), arms)
 
 
-def train(name, settings, folder, **how):
-    return experiment.train(experiment.prepare(name, settings), folder, **how)
+def train(settings, folder, **options):
+    return fit.train(prepare(settings), folder, **options)
 
 
 def read_wandb(path):
@@ -52,6 +57,8 @@ def read_wandb(path):
 
 def numbers(record):
     """Everything but what a clock says."""
+    if isinstance(record, Record):
+        record = record.to_json()
     if isinstance(record, dict):
         return {k: numbers(v) for k, v in record.items() if k != "train_seconds"}
     return [numbers(v) for v in record] if isinstance(record, list) else repr(record)
@@ -59,8 +66,8 @@ def numbers(record):
 
 @pytest.mark.parametrize("identity", IDS)
 def test_smoke_run_leaves_a_whole_record(identity, tmp_path, capsys):
-    found = load(identity)
-    experiment.run(found, tmp_path / "results", tmp_path / "runs")
+    loaded = load(identity)
+    experiment.run(loaded, tmp_path / "results", tmp_path / "runs")
     folder = tmp_path / "results" / "smoke" / "shapes" / identity
     assert {p.name for p in folder.iterdir()} == {
         "metrics.json",
@@ -68,29 +75,29 @@ def test_smoke_run_leaves_a_whole_record(identity, tmp_path, capsys):
         "per_pair.csv",
         "curves.png",
         "matches.png",
-        "views.json",
+        "snapshots.json",
     }
     record = json.loads((folder / "metrics.json").read_text())
-    assert list(record["arms"]) == list(found.settings)
-    assert record["test_pairs"] == found.test_pairs
-    bands = max(1, len(found.bands_deg) - 1)
+    assert list(record["arms"]) == list(loaded.arms)
+    assert record["test_pairs"] == loaded.test_pairs
+    bands = max(1, len(loaded.bands_deg) - 1)
     for arm in record["arms"].values():
         assert arm["pairs"] == 8 * bands
         assert arm["pairs_seen"] == 32
         assert [point["pairs_seen"] for point in arm["curve"]] == [16, 32]
         assert len(arm.get("bands", [])) == (bands if bands > 1 else 0)
-        assert [part["outliers"] for part in arm.get("sweep", [])] == list(found.sweep_outliers)
+        assert [part["outliers"] for part in arm.get("sweep", [])] == list(loaded.sweep_outliers)
         assert 0 < arm["rotation_error_deg_mean"] < 180
     rows = list(csv.DictReader((folder / "per_pair.csv").open()))
-    tested = [*found.settings, *found.baselines]
+    tested = [*loaded.arms, *loaded.baselines]
     assert len(rows) == len(tested) * 8 * bands
     assert list(dict.fromkeys(row["arm"] for row in rows)) == tested
-    assert list(record["baselines"]) == list(found.baselines)
-    views = json.loads((folder / "views.json").read_text())
-    assert [view["rank"] for view in views] == ["easiest", "median", "hardest"]
-    errors = [view["rotation_error_deg"] for view in views]
+    assert list(record["baselines"]) == list(loaded.baselines)
+    snapshots = read_snapshots(folder)
+    assert [snapshot.rank for snapshot in snapshots] == ["easiest", "median", "hardest"]
+    errors = [snapshot.rotation_error_deg for snapshot in snapshots]
     assert errors == sorted(errors)
-    assert all(len(view["steps"][-1]["matched"]) == len(view["source"]) for view in views)
+    assert all(len(s.steps[-1].matched) == len(s.source) for s in snapshots)
     for picture in ("curves.png", "matches.png"):
         assert (folder / picture).read_bytes().startswith(b"\x89PNG")
     assert "correct matches, %" in capsys.readouterr().out
@@ -105,31 +112,51 @@ def test_the_same_command_gives_the_same_numbers_bit_for_bit(tmp_path):
 
 
 def test_test_pairs_that_are_not_the_recipes_are_named(tmp_path, capsys):
-    found = dataclasses.replace(load("3.3", arms=["PCRNet_corr"]), test_pairs="others")
-    experiment.run(found, tmp_path / "results", tmp_path / "runs", "none")
+    loaded = dataclasses.replace(load("3.3", arms=["PCRNet_corr"]), test_pairs="others")
+    experiment.run(loaded, tmp_path / "results", tmp_path / "runs", "none")
     assert "are not the recipe's (others)" in capsys.readouterr().out
 
 
-def test_per_pair_transforms_score_to_the_metrics_of_the_record(tmp_path):
-    """Predict once, score many: the CSV alone gives the record's numbers again."""
-    found = load("1.1")
-    record = experiment.run(found, tmp_path / "results", tmp_path / "runs")
-    rows = list(csv.DictReader((tmp_path / "results/smoke/shapes/1.1/per_pair.csv").open()))
-    pairs = experiment.make_datamodule(found.settings["DCP"]).test_dataloader().dataset
-    truth = pairs.__getitems__([(0, i) for i in range(len(pairs))])
-    for arm, scores in record["arms"].items():
-        own = [row for row in rows if row["arm"] == arm]
-        mean = sum(float(row["rotation_error_deg"]) for row in own) / len(own)
-        assert mean == pytest.approx(scores["rotation_error_deg_mean"], rel=1e-4)
-        right, total = (sum(int(row[k]) for row in own) for k in ("right", "rows"))
-        assert right / total == pytest.approx(scores["match_accuracy"])
-        transform = torch.tensor([[float(v) for v in row["transform"].split()] for row in own])
-        error = rotation_error_deg(transform[:, :9].view(-1, 3, 3), truth.rotation)
-        stated = torch.tensor([float(row["rotation_error_deg"]) for row in own])
-        torch.testing.assert_close(error.float(), stated, rtol=1e-3, atol=1e-2)
-        off = (transform[:, 9:] - truth.translation).norm(dim=1)
-        stated = torch.tensor([float(row["translation_error"]) for row in own])
-        torch.testing.assert_close(off, stated, rtol=1e-3, atol=1e-4)
+@pytest.mark.parametrize("identity", ["1.1", "2.4"])
+def test_per_pair_csv_alone_gives_every_rotation_metric_of_the_record(identity, tmp_path):
+    """Predict once, score many: 2.4 is tested in bands, whose rows follow each other."""
+    record = experiment.run(load(identity), tmp_path / "results", tmp_path / "runs")
+    folder = tmp_path / "results/smoke/shapes" / identity
+    table = list(csv.DictReader((folder / "per_pair.csv").open()))
+    for arm, result in (record.arms | record.baselines).items():
+        rows = [row for row in table if row["arm"] == arm]
+        predicted, truth = (
+            torch.tensor([[float(v) for v in row[name].split()] for row in rows])
+            for name in ("transform", "true_transform")
+        )
+        rotations = [t[:, :9].reshape(-1, 3, 3) for t in (predicted, truth)]
+        metrics = metrics_of(rotations, predicted[:, 9:], truth[:, 9:])
+        for name, value in metrics.items():
+            assert float(value) == pytest.approx(result.metrics[name], rel=1e-6, abs=1e-9), name
+        stated = torch.tensor([float(row["rotation_error_deg"]) for row in rows]).double()
+        torch.testing.assert_close(rotation_error_deg(*rotations), stated, rtol=1e-6, atol=1e-6)
+        correct, total = (
+            sum(int(row[name]) for row in rows) for name in ("num_correct", "num_matchable")
+        )
+        assert correct / total == result.metrics["match_accuracy"]
+
+
+def metrics_of(rotations, translation, true_translation):
+    """The metrics of SPEC.md section 5, from transforms alone, by scipy's Euler angles."""
+    predicted, truth = (Rotation.from_matrix(r.double().numpy()) for r in rotations)
+    relative = (predicted * truth.inv()).as_euler("zyx", degrees=True)
+    naive = predicted.as_euler("zyx", degrees=True) - truth.as_euler("zyx", degrees=True)
+    error = rotation_error_deg(*rotations)
+    off = (translation - true_translation).double()
+    close = (error < 5) & (off.norm(dim=1) < 0.05)
+    return {
+        "rotation_error_deg_mean": error.mean(),
+        "relative_euler_rmse_deg": (relative**2).mean() ** 0.5,
+        "relative_euler_mae_deg": abs(relative).mean(),
+        "naive_euler_rmse_deg": (naive**2).mean() ** 0.5,
+        "translation_rmse": off.square().mean().sqrt(),
+        "recall@5deg_0.05": close.double().mean(),
+    }
 
 
 def test_experiment_1_4_takes_the_networks_of_1_1(tmp_path, capsys):
@@ -137,8 +164,8 @@ def test_experiment_1_4_takes_the_networks_of_1_1(tmp_path, capsys):
     capsys.readouterr()
     again = experiment.run(load("1.4"), tmp_path / "results", tmp_path / "runs")
     assert capsys.readouterr().out.count("trained already: ") == 2
-    for arm in first["arms"]:
-        assert again["arms"][arm]["curve"] == first["arms"][arm]["curve"]
+    for arm in first.arms:
+        assert again.arms[arm].curve == first.arms[arm].curve
     alone = experiment.run(load("1.4"), tmp_path / "other", tmp_path / "other_runs")
     assert numbers(alone) == numbers(again)
     capsys.readouterr()
@@ -147,9 +174,9 @@ def test_experiment_1_4_takes_the_networks_of_1_1(tmp_path, capsys):
 
 
 def test_the_real_part_runs_by_the_same_command(tmp_path):
-    found = load("1.2", "--data.data", "modelnet40", "--data.root", str(shared("data")))
-    record = experiment.run(found, tmp_path / "results", tmp_path / "runs")
-    assert record["data"] == "modelnet40"
+    loaded = load("1.2", "--data.data", "modelnet40", "--data.root", str(shared("data")))
+    record = experiment.run(loaded, tmp_path / "results", tmp_path / "runs")
+    assert record.data == "modelnet40"
     config = (tmp_path / "results/smoke/modelnet40/1.2/config.yaml").read_text()
     assert str(shared("data")) not in config
 
@@ -159,11 +186,11 @@ def press_ctrl_c(during, step, patch):
     original = getattr(RegistrationModule, during)
 
     def interrupted(self, batch, batch_index):
-        found = original(self, batch, batch_index)
+        result = original(self, batch, batch_index)
         if self.global_step == step and batch_index != 1:
             patch.undo()
             os.kill(os.getpid(), signal.SIGINT)
-        return found
+        return result
 
     patch.setattr(RegistrationModule, during, interrupted)
 
@@ -182,17 +209,17 @@ def test_ctrl_c_and_the_same_command_end_as_if_nothing_had_been(
     during, step, workers, tmp_path, capsys
 ):
     options = ["--trainer.max_steps", "20", "--data.num_workers", str(workers)]
-    settings, folder = load("1.1", *options).settings["DCP_corr"], tmp_path / "DCP_corr"
-    whole = train("DCP_corr", settings, tmp_path / "whole")
+    settings, folder = load("1.1", *options).arms["DCP_corr"], tmp_path / "DCP_corr"
+    whole = train(settings, tmp_path / "whole")
     with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as stopped:  # noqa: PT012
         press_ctrl_c(during, step, patch)
-        train("DCP_corr", settings, folder)
+        train(settings, folder)
     assert stopped.value.code == 1
-    assert "the same command goes on from there" in capsys.readouterr().out
+    assert "the same command continues from there" in capsys.readouterr().out
     assert not (folder / "trained.json").exists()
     signal.signal(signal.SIGINT, signal.default_int_handler)  # Lightning leaves it ignored
-    trained = train("DCP_corr", settings, folder)
-    assert "going on from" in capsys.readouterr().out
+    trained = train(settings, folder)
+    assert "continuing from" in capsys.readouterr().out
     assert trained.pairs_seen == whole.pairs_seen == 80
     assert trained.curve == whole.curve
     for name in ("best.ckpt", "last.ckpt"):
@@ -204,10 +231,10 @@ def test_ctrl_c_and_the_same_command_end_as_if_nothing_had_been(
 
 
 def test_ctrl_c_in_the_last_step_stops_the_run_with_its_arm_trained(tmp_path, capsys):
-    settings, folder = load("1.1").settings["DCP"], tmp_path / "DCP"
+    settings, folder = load("1.1").arms["DCP"], tmp_path / "DCP"
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):  # noqa: PT012
         press_ctrl_c("training_step", 7, patch)
-        train("DCP", settings, folder)
+        train(settings, folder)
     assert "stopping after this step" in capsys.readouterr().out
     assert json.loads((folder / "trained.json").read_text())["pairs_seen"] == 32
 
@@ -215,28 +242,29 @@ def test_ctrl_c_in_the_last_step_stops_the_run_with_its_arm_trained(tmp_path, ca
 def test_a_network_that_the_paper_knows_nothing_of_leaves_a_record(tmp_path):
     """Without a matrix to be looked at, and without a figure of the paper's to follow."""
     options = ["--trainer.enable_progress_bar", "false"]
-    found = recipe.load(ROOT / "configs" / "weights.yaml", "smoke", options)
-    experiment.run(found, tmp_path / "results", tmp_path / "runs")
-    folder = tmp_path / "results" / "smoke" / "shapes" / found.id
+    overrides = recipe.parse_overrides(options)
+    loaded = recipe.load(ROOT / "configs" / "weights.yaml", "smoke", overrides)
+    experiment.run(loaded, tmp_path / "results", tmp_path / "runs")
+    folder = tmp_path / "results" / "smoke" / "shapes" / loaded.id
     assert (folder / "curves.png").is_file()
     assert not (folder / "matches.png").exists()
-    assert "Invariant_corr" in page.build(tmp_path / "results")
+    assert "Invariant_corr" in build_page(tmp_path / "results")
 
 
 def test_other_settings_do_not_go_on_from_an_old_checkpoint(tmp_path, capsys):
     with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit):  # noqa: PT012
         press_ctrl_c("training_step", 5, patch)
-        train("DCP", load("1.1").settings["DCP"], tmp_path / "DCP")
+        train(load("1.1").arms["DCP"], tmp_path / "DCP")
     signal.signal(signal.SIGINT, signal.default_int_handler)
     capsys.readouterr()
-    settings = load("1.1", "--optimizer.lr", "1e-4").settings["DCP"]
-    train("DCP", settings, tmp_path / "DCP")
-    assert "going on" not in capsys.readouterr().out
+    settings = load("1.1", "--optimizer.lr", "1e-4").arms["DCP"]
+    train(settings, tmp_path / "DCP")
+    assert "continuing" not in capsys.readouterr().out
 
 
 def test_an_arm_that_was_finished_is_not_trained_again_before_its_record(tmp_path, capsys):
     """Ctrl-C in the second arm costs nothing of the first; a recorded run starts anew."""
-    found = load("1.1")
+    loaded = load("1.1")
     with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit):  # noqa: PT012
         original = experiment.train
 
@@ -246,27 +274,27 @@ def test_an_arm_that_was_finished_is_not_trained_again_before_its_record(tmp_pat
             return original(arm, *rest, **named)
 
         patch.setattr(experiment, "train", second_is_stopped)
-        experiment.run(found, tmp_path / "results", tmp_path / "runs")
+        experiment.run(loaded, tmp_path / "results", tmp_path / "runs")
     signal.signal(signal.SIGINT, signal.default_int_handler)
     assert not (tmp_path / "results").exists()
     capsys.readouterr()
-    record = experiment.run(found, tmp_path / "results", tmp_path / "runs")
+    record = experiment.run(loaded, tmp_path / "results", tmp_path / "runs")
     shown = capsys.readouterr().out
-    assert shown.count("trained already") == shown.count("going on from") == 1
-    again = experiment.run(found, tmp_path / "results", tmp_path / "runs")
+    assert shown.count("trained already") == shown.count("continuing from") == 1
+    again = experiment.run(loaded, tmp_path / "results", tmp_path / "runs")
     assert "trained already" not in capsys.readouterr().out
     assert numbers(again) == numbers(record)
 
 
 def test_the_last_step_is_validated_wherever_it_falls(tmp_path):
-    settings = load("1.1", "--trainer.max_steps", "6").settings["DCP"]
-    trained = train("DCP", settings, tmp_path / "DCP")
+    settings = load("1.1", "--trainer.max_steps", "6").arms["DCP"]
+    trained = train(settings, tmp_path / "DCP")
     assert [point["pairs_seen"] for point in trained.curve] == [16, 24]
 
 
 def test_nothing_is_deleted_or_trained_when_the_test_split_cannot_be_read(tmp_path):
-    found = load("1.1")
-    experiment.run(found, tmp_path / "results", tmp_path / "runs")
+    loaded = load("1.1")
+    experiment.run(loaded, tmp_path / "results", tmp_path / "runs")
     best = tmp_path / "runs/smoke/shapes/1.1/DCP/best.ckpt"
     before = best.stat().st_mtime_ns
     for bad in (
@@ -294,7 +322,7 @@ def test_nothing_is_deleted_or_trained_when_the_test_split_cannot_be_read(tmp_pa
 
 @pytest.mark.parametrize("option", ["iterations", "test_iterations"])
 def test_a_network_without_an_iteration_is_refused_before_training(option, tmp_path):
-    with pytest.raises(CorrmatError, match="no network of these"):
+    with pytest.raises(CorrmatError, match="cannot build RPMNet from the --network options"):
         experiment.run(load("2.1", f"--network.{option}", "0"), tmp_path / "r", tmp_path / "runs")
     assert not list(tmp_path.rglob("*.ckpt"))
 
@@ -335,8 +363,8 @@ def no_network(monkeypatch):
 
 
 def test_wandb_holds_config_curves_table_pictures_and_clouds_offline(tmp_path, no_network):
-    found = load("1.2")
-    experiment.run(found, tmp_path / "results", tmp_path / "runs", logger="wandb")
+    loaded = load("1.2")
+    experiment.run(loaded, tmp_path / "results", tmp_path / "runs", logger="wandb")
     runs = tmp_path / "runs" / "smoke" / "shapes" / "1.2"
     read = {}
     for path in runs.glob("**/offline-run-*/*.wandb"):
@@ -369,17 +397,17 @@ def test_wandb_holds_config_curves_table_pictures_and_clouds_offline(tmp_path, n
 
 @pytest.mark.parametrize(("logger", "there"), [("csv", {"csv"}), ("none", set())])
 def test_loggers_can_be_left_out(logger, there, tmp_path, no_network):
-    train("DCP", load("1.1").settings["DCP"], tmp_path / "DCP", logger=logger)
+    train(load("1.1").arms["DCP"], tmp_path / "DCP", logger=logger)
     assert {name for name in ("csv", "wandb") if (tmp_path / "DCP" / name).exists()} == there
 
 
 def test_a_board_shows_every_arm(tmp_path):
     text = io.StringIO()
-    console.listen(0)
+    console.print_messages(0)
     board = console.Board(Console(file=text, force_terminal=True, width=120))
-    settings = load("1.1").settings["DCP_corr"]
+    settings = load("1.1").arms["DCP_corr"]
     with board:
-        train("DCP_corr", settings, tmp_path / "run", board=board)
+        train(settings, tmp_path / "run", board=board)
     shown = text.getvalue()
     for word in ("arm", "pairs/s", "time left", "DCP_corr", "8/8", "rotation error", "done in 0:0"):
         assert word in shown
@@ -387,12 +415,12 @@ def test_a_board_shows_every_arm(tmp_path):
 
 
 def test_a_board_of_a_run_that_ends_by_the_clock_knows_no_time_left(tmp_path):
-    console.listen(0)
+    console.print_messages(0)
     board = console.Board(Console(file=io.StringIO(), force_terminal=True))
     endless = ["--trainer.max_steps", "-1", "--trainer.max_time", "00:00:00:02"]
-    found = load("1.1", "--optimizer.schedule", "step", *endless)
+    loaded = load("1.1", "--optimizer.schedule", "step", *endless)
     with board:
-        train("DCP", found.settings["DCP"], tmp_path / "run", board=board)
+        train(loaded.arms["DCP"], tmp_path / "run", board=board)
     assert int(board.rows["DCP"]["step"]) > 0
 
 
@@ -400,13 +428,13 @@ def test_a_board_that_nobody_watches_draws_nothing(tmp_path):
     text = io.StringIO()
     with console.Board(Console(file=text)) as board:
         board.update("DCP", step="1/2")
-    assert not board.watched
+    assert not board.is_visible
     assert text.getvalue() == ""
 
 
 @pytest.mark.parametrize("arm", ["1.1 DCP", "2.2 RPMNet_corr", "3.2 PCRNet"])
 def test_a_machine_that_is_fast_in_bfloat16_trains_in_it(arm, tmp_path, monkeypatch):
-    monkeypatch.setattr(experiment, "default_precision", lambda accelerator: "bf16-mixed")
+    monkeypatch.setattr(hardware, "fast_precision", lambda accelerator: "bf16-mixed")
     seen = []
     original = RegistrationModule.training_step
 
@@ -416,13 +444,13 @@ def test_a_machine_that_is_fast_in_bfloat16_trains_in_it(arm, tmp_path, monkeypa
 
     monkeypatch.setattr(RegistrationModule, "training_step", noted)
     identity, name = arm.split()
-    found = load(identity, arms=[name])
-    assert found.settings[name].trainer.gradient_clip_val
-    ready = experiment.prepare(name, found.settings[name])
-    trained = experiment.train(ready, tmp_path / name)
+    loaded = load(identity, arms=[name])
+    assert loaded.arms[name].trainer.gradient_clip_val
+    ready = prepare(loaded.arms[name])
+    trained = fit.train(ready, tmp_path / name)
     assert set(seen) == {("bf16-mixed", True)}
     assert math.isfinite(trained.curve[-1]["loss"])
-    (pairs,) = experiment.score(experiment.trained_module(ready, trained.checkpoint), ready)
+    (pairs,) = fit.score(fit.load_trained(ready, trained.checkpoint), ready)
     assert pairs["rotation_error_deg"].isfinite().all()
 
 
@@ -431,18 +459,15 @@ def test_a_machine_that_is_fast_in_bfloat16_trains_in_it(arm, tmp_path, monkeypa
     [(4, 4, 1), ("auto", 0, 1), (-1, 0, 1), ("3", 3, 1), ([3, 1], 2, [3]), ("2,5", 2, [2])],
 )
 def test_a_test_runs_on_the_first_device_that_is_named(devices, count, one):
-    assert experiment._devices(devices) == count
-    assert experiment._first(devices) == one
+    assert hardware.count_devices(devices) == count
+    assert hardware.first_device(devices) == one
 
 
 def test_checkpoints_reload_to_the_same_network(tmp_path):
-    settings = load("1.1").settings["DCP_corr"]
-    trained = train("DCP_corr", settings, tmp_path / "run")
-    arm = experiment.prepare("DCP_corr", settings)
-    first, again = (
-        experiment.score(experiment.trained_module(arm, trained.checkpoint), arm)[0]
-        for _ in range(2)
-    )
+    settings = load("1.1").arms["DCP_corr"]
+    trained = train(settings, tmp_path / "run")
+    arm = prepare(settings)
+    first, again = (fit.score(fit.load_trained(arm, trained.checkpoint), arm)[0] for _ in range(2))
     assert torch.equal(first["transform"], again["transform"])
     assert math.isfinite(float(first["rotation_error_deg"].mean()))
 
@@ -465,9 +490,9 @@ def test_a_record_is_json_that_everybody_can_read(tmp_path, monkeypatch):
 
 
 def test_a_record_says_what_its_arms_were_trained_on(tmp_path, monkeypatch):
-    monkeypatch.setattr(experiment, "default_precision", lambda accelerator: "bf16-mixed")
+    monkeypatch.setattr(hardware, "fast_precision", lambda accelerator: "bf16-mixed")
     steps = ["--trainer.max_steps", "2"]
-    hardware = experiment.run(load("3.2", *steps), tmp_path / "results", tmp_path / "r")["hardware"]
-    assert hardware["precision"] == "bf16-mixed / 32-true"  # PCRNet_corr: see pcrnet.yaml
-    assert hardware["threads"] == torch.get_num_threads()
-    assert hardware["gpu"] == torch.cuda.is_available()
+    record = experiment.run(load("3.2", *steps), tmp_path / "results", tmp_path / "r")
+    assert record.hardware["precision"] == "bf16-mixed / 32-true"  # PCRNet_corr: see pcrnet.yaml
+    assert record.hardware["threads"] == torch.get_num_threads()
+    assert record.hardware["gpu"] == torch.cuda.is_available()

@@ -6,10 +6,10 @@ import torch.nn.functional as F
 from conftest import random_rotation
 
 from corrmat.data.pairs import Key, PairSettings, make_pairs
-from corrmat.data.shapes import load
+from corrmat.data.shapes.dataset import load
 from corrmat.losses import mutual_loss, mutual_matches
 from corrmat.methods import InvariantCorr
-from corrmat.networks.invariant import InvariantNetwork, radius, spread
+from corrmat.networks.invariant import InvariantNetwork, evenly_spaced_indices, radius
 from corrmat.networks.ppf import SIGNLESS, signless_pair_features
 from corrmat.ops import streaming
 from corrmat.ops.correspondence import MatchabilityCorrespondence
@@ -95,8 +95,8 @@ def test_radius_does_not_follow_an_outlier_and_spread_goes_from_end_to_end(gener
     far = points.clone()
     far[0, 0] = 20.0
     assert radius(far) == pytest.approx(float(radius(points)), rel=0.1)
-    assert spread(10, 4).tolist() == [0, 3, 6, 9]
-    assert spread(2, 3).tolist() == [0, 0, 1]
+    assert evenly_spaced_indices(10, 4).tolist() == [0, 3, 6, 9]
+    assert evenly_spaced_indices(2, 3).tolist() == [0, 0, 1]
 
 
 def test_mutual_matches_are_the_loops(generator):
@@ -168,10 +168,10 @@ def test_the_method_learns_eight_pairs_of_two_scans(generator):
     """Not by heart, but downhill: the loss of a small network falls in 30 steps."""
     torch.manual_seed(0)
     how = PairSettings(64, keep=0.7, sampling="disjoint", outliers=0.05, outlier_distance=0.2,
-        spoilt="both", normals="estimated")  # fmt: skip
+        corrupted="both", normals="estimated")  # fmt: skip
     batch = make_pairs(load("train", 8), range(8), [Key(0, 0, 0, i) for i in range(8)], how)
-    method = InvariantCorr(InvariantNetwork(32, 2, 1, anchors=16, neighbors=4))
-    method.reach = 0.2
+    network = {"width": 32, "heads": 2, "layers": 1, "anchors": 16, "neighbors": 4}
+    method = InvariantCorr(network, loss={"max_distance": 0.2})
     adam = torch.optim.Adam(method.parameters(), 3e-3)
     losses = []
     for _ in range(30):
@@ -188,5 +188,5 @@ def test_a_network_without_doubt_cannot_be_trained_so(generator):
         load("train", 2), range(2), [Key(0, 0, 0, i) for i in range(2)], PairSettings(32)
     )
     assert isinstance(batch, PairBatch)
-    with pytest.raises(ValueError, match="no doubt about target points"):
+    with pytest.raises(ValueError, match="predicts matchability"):
         InvariantCorr().loss(Prediction(batch.rotation, batch.translation), batch)

@@ -6,8 +6,6 @@ import torch
 from corrmat.data.datamodule import RegistrationDataModule
 from corrmat.methods import METHODS
 from corrmat.metrics import match_accuracy, rotation_error_deg
-from corrmat.module import OptimizerSettings
-from corrmat.networks.dcp import DCPNetwork
 
 pytestmark = pytest.mark.slow
 
@@ -19,9 +17,8 @@ def train(arm, steps, rotation_deg, fresh_pairs):
         num_points=32, batch_size=8, rotation_deg=rotation_deg, train_shapes=100, test_shapes=8
     )
     train, test = data.train_dataloader(), data.test_dataloader()
-    method = METHODS[arm](
-        DCPNetwork(64, "transformer", 4, 128, (32, 32, 32, 64), 8), OptimizerSettings()
-    )
+    network = {"width": 64, "feedforward": 128, "edge_channels": (32, 32, 32, 64), "k": 8}
+    method = METHODS[arm](network)
     adam = torch.optim.Adam(method.parameters(), 1e-3)
     fixed = next(iter(test))
     method.train()

@@ -44,9 +44,9 @@ def test_a_perfect_prediction_has_the_perfect_score(batch):
 def test_the_released_match_count_gives_a_perfect_prediction_almost_nothing():
     """It compared the matrix with its transpose: only fixed points and swaps count."""
     match = torch.tensor([[1, 2, 0, 3, 5, 4]])
-    assert metrics.right_matches(match, match, 6).tolist() == [6]
-    assert metrics.transposed_right_matches(match, match).tolist() == [3]
-    assert metrics.transposed_right_matches(match.argsort(), match).tolist() == [6]
+    assert metrics.num_correct(match, match, 6).tolist() == [6]
+    assert metrics.num_correct_transposed(match, match).tolist() == [3]
+    assert metrics.num_correct_transposed(match.argsort(), match).tolist() == [6]
     data = RegistrationDataModule(num_points=200, batch_size=8, test_shapes=8, train_shapes=2)
     pairs = next(iter(data.test_dataloader()))
     scores = metrics.RegistrationMetrics()
@@ -81,7 +81,7 @@ def test_naive_euler_angles_wrap_where_the_relative_ones_do_not():
 def test_matches_count_only_rows_that_have_one():
     match = torch.tensor([[0, 1, 2, -1, 5]])
     predicted = torch.tensor([[0, 1, 0, 3, 5]])
-    assert metrics.right_matches(predicted, match, num_target=5).tolist() == [2]
+    assert metrics.num_correct(predicted, match, num_target=5).tolist() == [2]
     assert metrics.match_accuracy(predicted, match, 5).tolist() == [pytest.approx(2 / 3)]
 
 

@@ -7,7 +7,7 @@ from twins import within_radius_loops
 
 from corrmat.networks.ppf import neighborhoods, point_pair_features
 from corrmat.ops import neighbors
-from corrmat.ops.neighbors import knn, nearest, take, within_radius
+from corrmat.ops.neighbors import gather_points, knn, nearest, within_radius
 
 
 @pytest.mark.parametrize("chunk", [1, 100, 2**24])
@@ -32,7 +32,7 @@ def test_nearest_is_exact(chunk, generator, monkeypatch):
     y = 100 + 0.01 * torch.randn(2, 11, 3, generator=generator, dtype=torch.float64)
     expected = (x.unsqueeze(2) - y.unsqueeze(1)).norm(dim=-1).argmin(-1)
     assert torch.equal(nearest(x, y), expected)
-    assert torch.equal(take(y, expected)[1, 3], y[1, expected[1, 3]])
+    assert torch.equal(gather_points(y, expected)[1, 3], y[1, expected[1, 3]])
     assert knn(y, 1).squeeze(-1).tolist() == [list(range(11))] * 2
 
 

@@ -1,10 +1,12 @@
+import functools
+
 import pytest
 import torch
 from twins import (
-    PlainEdgeConvolution,
     attention,
     neighborhood_net,
     one_hot_loss,
+    plain_edge_mlp,
     released_dcp,
     released_rpmnet,
     std_norm,
@@ -12,13 +14,12 @@ from twins import (
 
 from corrmat.losses import correspondence_loss
 from corrmat.methods import DCP, METHODS, DCPCorr
-from corrmat.networks import edges
 from corrmat.networks.attention import Attention, StdNorm, Transformer
 from corrmat.networks.dcp import DCPNetwork
 from corrmat.networks.dgcnn import DGCNN, EdgeConvolution, edge_features
-from corrmat.networks.edges import moments
 from corrmat.networks.ppf import neighborhoods
 from corrmat.networks.rpmnet import NeighborhoodNet
+from corrmat.ops import edge_mlp
 from corrmat.ops.neighbors import knn
 from corrmat.types import PairBatch
 
@@ -36,52 +37,59 @@ def small(pointer="transformer"):
     return DCPNetwork(16, pointer, 2, 16, (8, 8, 12, 16), 5)
 
 
-@pytest.mark.parametrize("mode", ["train", "eval"])
-@pytest.mark.parametrize("last", [False, True])
-def test_folded_batch_norm_equals_the_plain_layer(mode, last):
+@pytest.mark.parametrize("training", [True, False])
+def test_the_fused_edge_mlp_equals_the_plain_layers(training):
     """Values, every gradient, and the running statistics that training leaves behind."""
 
     def draw(seed, *shape):
-        chance = torch.Generator().manual_seed(seed)
-        return torch.randn(*shape, dtype=torch.float64, generator=chance)
+        random = torch.Generator().manual_seed(seed)
+        return torch.randn(*shape, dtype=torch.float64, generator=random)
 
-    found = []
-    for kind in (EdgeConvolution, PlainEdgeConvolution):
+    results = []
+    for mlp in (functools.partial(edge_mlp.batch_norm_edge_mlp, training=training), plain_edge_mlp):
         torch.manual_seed(1)
-        layers = [kind(6, 10).double(), kind(10, 5).double()]
+        layers = [EdgeConvolution(6, 10).double(), EdgeConvolution(10, 5).double()]
         for layer in layers:
             layer.norm.weight.data = torch.linspace(-1, 2, len(layer.norm.weight)).double()
             layer.norm.bias.data = torch.linspace(-0.5, 0.5, len(layer.norm.bias)).double()
-        rows = (draw(2, 1, 30, 4, 6) + 1).requires_grad_()
-        first = layers[0](rows, moments(rows))
-        layers[1](first.rows, first.moments)  # leaves running statistics
-        for layer in layers:
-            layer.train(mode == "train")
-        seen = moments(rows) if mode == "train" else None
-        first = layers[0](rows, seen)
-        second = layers[1](first.rows, first.moments, last=last)
-        value = (first.top * draw(3, 1, 30, 10)).sum() + (second.top * draw(4, 1, 30, 5)).sum()
-        if not last:
-            value = value + (second.rows * draw(5, 1, 30, 4, 5)).sum()
-        value.backward()
-        stats = [getattr(layer.norm, name) for layer in layers for name in STATISTICS]
-        grads = [p.grad for layer in layers for p in layer.parameters()]
-        found.append([first.rows, first.top, second.top, rows.grad, *grads, *stats])
-    for fast, naive in zip(*found, strict=True):
-        torch.testing.assert_close(fast, naive, rtol=1e-9, atol=1e-10)
+            layer.norm.running_mean.fill_(0.1)
+            layer.train(training)
+        edges = (draw(2, 30, 4, 6) + 1).requires_grad_()
+        pooled = mlp(edges, [la.linear for la in layers], [la.norm for la in layers])
+        (sum((p * draw(3 + i, *p.shape)).sum() for i, p in enumerate(pooled))).backward()
+        statistics = [getattr(layer.norm, name) for layer in layers for name in STATISTICS]
+        gradients = [p.grad for layer in layers for p in layer.parameters()]
+        results.append([*pooled, edges.grad, *gradients, *statistics])
+    for fused, plain in zip(*results, strict=True):
+        torch.testing.assert_close(fused, plain, rtol=1e-9, atol=1e-10)
+
+
+def test_dgcnn_gives_the_same_with_and_without_the_fused_kernel(monkeypatch, generator):
+    torch.manual_seed(0)
+    network = DGCNN(16, (8, 8, 12, 16), 5).double()
+    points = torch.randn(2, 30, 3, dtype=torch.float64, generator=generator)
+    results = []
+    for fewest in (0, 10**9):
+        monkeypatch.setattr(edge_mlp, "_MIN_EDGES", fewest)
+        network.zero_grad()
+        features = network(points)
+        features.square().sum().backward()
+        results.append([features, *(p.grad.clone() for p in network.parameters())])
+    for fused, plain in zip(*results, strict=True):
+        torch.testing.assert_close(fused, plain, rtol=1e-8, atol=1e-9)
 
 
 @pytest.mark.parametrize("slab", [1, 7, 8192])
 def test_folded_group_norm_equals_the_plain_network(slab, monkeypatch, generator):
     """Values and gradients, however the edges are cut into slabs."""
-    monkeypatch.setattr(edges, "_ROWS", slab)
+    monkeypatch.setattr(edge_mlp, "_SLAB_ROWS", slab)
     torch.manual_seed(0)
     network = NeighborhoodNet(16).double()
     cloud = torch.randn(2, 9, 6, dtype=torch.float64, generator=generator)
-    around = neighborhoods(cloud, 1.5, 5)
+    local = neighborhoods(cloud, 1.5, 5)
     pull = torch.randn(2, 9, 16, dtype=torch.float64, generator=generator)
     found = []
-    for value in (network(around), neighborhood_net(around.features(), network)):
+    for value in (network(local), neighborhood_net(local.features(), network)):
         network.zero_grad()
         (value * pull).sum().backward()
         found.append([value, *(p.grad.clone() for p in network.parameters())])
@@ -93,9 +101,10 @@ def test_ties_give_their_gradient_once():
     """Two equal neighbours: the maximum's gradient goes to one of them, not to both."""
     torch.manual_seed(0)
     layer = EdgeConvolution(3, 4).double().eval()
-    rows = torch.randn(1, 6, 1, 3, dtype=torch.float64).expand(-1, -1, 2, -1).clone()
-    layer(rows.requires_grad_(), None).top.sum().backward()
-    given = (rows.grad != 0).any(-1)
+    edges = torch.randn(6, 1, 3, dtype=torch.float64).expand(-1, 2, -1).clone().requires_grad_()
+    (pooled,) = edge_mlp.batch_norm_edge_mlp(edges, [layer.linear], [layer.norm], training=False)
+    pooled.sum().backward()
+    given = (edges.grad != 0).any(-1)
     assert given.any(-1).any()
     assert not given.all(-1).any()
 
@@ -104,7 +113,7 @@ def test_edges_are_neighbour_then_centre(generator):
     points = torch.randn(2, 6, 3, generator=generator)
     neighbors = knn(points, 3)
     assert torch.equal(neighbors[..., 0], torch.arange(6).expand(2, -1))  # itself is nearest
-    rows = edge_features(points, neighbors).view(2, 6, 3, 6)
+    rows = edge_features(points, neighbors)
     assert torch.equal(rows[1, 4, 2], torch.cat([points[1, neighbors[1, 4, 2]], points[1, 4]]))
 
 
@@ -199,7 +208,7 @@ def test_the_papers_network_has_its_size():
     assert round(sum(p.numel() for p in DCPCorr().parameters()) / 1e6, 2) == 5.57
     assert isinstance(DCP().network.pointer, Transformer)
     assert DGCNN().k == 20
-    assert DCP().optimizer.lr == 1e-3
+    assert DCP().optimizer_settings.lr == 1e-3
     assert set(METHODS) >= {"DCP", "DCP_corr"}
 
 
@@ -207,7 +216,7 @@ def test_the_papers_network_has_its_size():
 def test_a_step_in_bfloat16_is_near_the_one_in_float32(name, generator):
     """What must be exact stays in float32: the loss agrees as far as bfloat16 features do."""
     torch.manual_seed(0)
-    method = METHODS[name](METHODS[name].network_type(**TINY[name.removesuffix("_corr")]))
+    method = METHODS[name](TINY[name.removesuffix("_corr")])
     method.log = lambda *args, **options: None
     target = torch.randn(2, 24, 6, generator=generator)
     target[..., 3:] /= target[..., 3:].norm(dim=-1, keepdim=True)

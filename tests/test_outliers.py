@@ -5,13 +5,13 @@ from conftest import golden
 from corrmat import metrics
 from corrmat.data.datamodule import RegistrationDataModule
 from corrmat.losses import correspondence_loss
-from corrmat.networks.compare import COMPARE
 from corrmat.networks.dcp import DCPNetwork
+from corrmat.networks.matching import MATCHING_HEADS
 from corrmat.ops.correspondence import SoftCorrespondence, outlier_feature
 from corrmat.ops.rigid import procrustes
 from corrmat.types import Prediction
 
-WAYS = [name for name in COMPARE if name != "none"]
+WAYS = [name for name in MATCHING_HEADS if name != "none"]
 
 
 def features(generator):
@@ -53,7 +53,7 @@ def test_features_of_zero_have_a_finite_outlier():
 def test_index_m_is_a_class_of_its_own(way, generator):
     torch.manual_seed(0)
     f_x, f_y = features(generator)
-    c = COMPARE[way](16).double()(f_x, f_y)
+    c = MATCHING_HEADS[way](16).double()(f_x, f_y)
     p = c.prob()
     assert p.shape == c.logits().shape == (2, 7, 10)
     assert (p.sum(-1) <= 1 + 1e-9).all()
@@ -85,7 +85,7 @@ def test_a_row_that_is_all_outlier_has_no_weight(generator):
 def test_matchability_is_lightglues_formula(generator):
     torch.manual_seed(0)
     f_x, f_y = features(generator)
-    head = COMPARE["matchability"](16).double()
+    head = MATCHING_HEADS["matchability"](16).double()
     p = head(f_x, f_y).prob()
     s = f_x @ f_y.mT / 4
     m_x, m_y = head.head(f_x).sigmoid(), head.head(f_y).sigmoid()
@@ -135,5 +135,5 @@ def test_perfect_weights_give_the_perfect_pose():
 def test_precision_and_recall_of_the_outlier_class():
     predicted = torch.tensor([[5, 5, 0, 1, 5]])
     match = torch.tensor([[5, 1, 0, 5, -1]])
-    found, called, there = metrics.outlier_counts(predicted, match, 5)
-    assert (found.item(), called.item(), there.item()) == (1, 3, 2)
+    correct, positive, true = metrics.outlier_counts(predicted, match, 5)
+    assert (correct.item(), positive.item(), true.item()) == (1, 3, 2)

@@ -8,8 +8,12 @@ import subprocess
 import pytest
 from test_report import RECORD
 
-from corrmat import page, record, robustness
 from corrmat.cli import main
+from corrmat.reporting import plots, provenance, robustness
+from corrmat.reporting.page import build_page
+from corrmat.reporting.record import Record
+from corrmat.reporting.snapshots import PairSnapshot
+from corrmat.reporting.writer import null_for_nan
 
 BROWSER = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
@@ -36,8 +40,7 @@ def results(tmp_path):
         ],
     }
     for identity in ("1.1", "outliers"):
-        found = json.loads(json.dumps(record._finite(RECORD))) | {"id": identity, "seed": 0}
-        found["hardware"] = {"threads": 1, "gpu": False}
+        found = json.loads(json.dumps(null_for_nan(RECORD))) | {"id": identity}
         folder = root / "smoke" / "shapes" / identity
         folder.mkdir(parents=True)
         for arm in found["arms"].values():
@@ -45,8 +48,8 @@ def results(tmp_path):
         if identity == "1.1":
             for arm in found["arms"].values():
                 arm["bands"] = [{"band_deg": [0, 30], "match_accuracy": 0.5}]
-            views = [view | {"rank": rank} for rank in ("easiest", "median", "hardest")]
-            (folder / "views.json").write_text(json.dumps(views))
+            snapshots = [view | {"rank": rank} for rank in ("easiest", "median", "hardest")]
+            (folder / "snapshots.json").write_text(json.dumps(snapshots))
         (folder / "metrics.json").write_text(json.dumps(found))
         rows = ["arm,rotation_error_deg", "DCP,30", "DCP,20", "DCP_corr,1", "DCP_corr,nan"]
         (folder / "per_pair.csv").write_text("\n".join(rows))
@@ -55,7 +58,7 @@ def results(tmp_path):
 
 
 def test_every_section_is_there_and_nothing_is_fetched(results):
-    html = page.build(results)
+    html = build_page(results)
     for name in ("summary", "exp-1.1", "exp-outliers", "smoke-shapes-1.1", "robustness"):
         assert f'id="{name}"' in html
     own = html[: html.index("<script>")]  # plotly's code names addresses that it never asks here
@@ -71,7 +74,7 @@ def test_every_section_is_there_and_nothing_is_fetched(results):
 
 
 def test_every_number_names_the_file_and_the_command_it_comes_from(results):
-    html = page.build(results)
+    html = build_page(results)
     titles = re.findall(r'title="([^"]+)"', html[: html.index("<script>")])
     assert titles
     for title in titles:
@@ -85,13 +88,13 @@ def test_every_number_names_the_file_and_the_command_it_comes_from(results):
 
 
 def test_a_record_of_ones_own_recipe_has_no_make_target():
-    record = {"id": "mine", "scale": "laptop", "data": "shapes", "seed": 0, "paper": {}}
-    assert page.command(record) == "corrmat run --config ... --scale laptop"
+    record = Record.from_json(RECORD | {"id": "mine", "scale": "laptop", "paper": {}})
+    assert provenance.command(record) == "corrmat run --config ... --scale laptop"
 
 
 def test_the_slider_of_a_view_shows_one_stage_at_a_time(results):
-    view = json.loads((results / "smoke/shapes/1.1/views.json").read_text())[0]
-    found = page._view(view)
+    snapshot = json.loads((results / "smoke/shapes/1.1/snapshots.json").read_text())[0]
+    found = plots.snapshot_plot(PairSnapshot.from_json(snapshot))
     steps = found["layout"]["sliders"][0]["steps"]
     assert [step["label"] for step in steps] == ["before", "iteration 1"]
     for step in steps:
@@ -118,27 +121,32 @@ def test_a_record_whose_code_has_changed_is_marked(tmp_path):
     git("init", "-q")
     git("add", "-A")
     git("commit", "-qm", "first")
-    arms = {"DCP": {"trained_at": git("rev-parse", "--short=12", "HEAD")}}
-    found = {"id": "1.1", "arms": arms}
-    assert page.staleness(found, tmp_path) == ""
+
+    first = git("rev-parse", "--short=12", "HEAD")
+
+    def staleness(commit=first):
+        arms = {"DCP": {"trained_at": commit}}
+        record = RECORD | {"id": "1.1", "arms": arms}
+        return provenance.staleness(Record.from_json(record), tmp_path)
+
+    assert staleness() == ""
     (tmp_path / "README.md").write_text("words change nothing\n")
-    assert page.staleness(found, tmp_path) == ""
+    assert staleness() == ""
     code.write_text('"""Nor does a docstring."""\n\n# nor a comment\na = (1)\n')
-    assert page.staleness(found, tmp_path) == ""
+    assert staleness() == ""
     recipe = tmp_path / "configs" / "exp" / "1.1.yaml"
     recipe.write_text("id: '1.1'  # of the paper\n")
-    assert page.staleness(found, tmp_path) == ""
+    assert staleness() == ""
     recipe.write_text("id: '1.1'\nseed: 1\n")
-    assert page.staleness(found, tmp_path) == "changed since: 1.1.yaml"
+    assert staleness() == "changed since: 1.1.yaml"
     git("checkout", "configs")
     code.write_text("a = 2\n")
-    assert page.staleness(found, tmp_path) == "changed since: losses.py"
+    assert staleness() == "changed since: losses.py"
     code.write_text("a = 1\n")
     (code.parent / "methods.py").write_text("b = 1\n")
     git("add", "-A")
-    assert page.staleness(found, tmp_path) == "changed since: methods.py"
-    arms["DCP"]["trained_at"] += "+"
-    assert page.staleness(found, tmp_path) == "trained with uncommitted code"
+    assert staleness() == "changed since: methods.py"
+    assert staleness("0123456789ab+") == "trained with uncommitted code"
 
 
 def test_what_cannot_be_written_is_said_in_one_line(tmp_path, results, capsys):
@@ -166,7 +174,7 @@ frame.addEventListener("load", () => {{
       width: page.documentElement.scrollWidth,
       drawn: page.querySelectorAll(".plot.js-plotly-plot").length,
       plots: page.querySelectorAll(".plot").length,
-      views: page.querySelectorAll(".view .gl-container canvas").length,
+      views: page.querySelectorAll(".snapshot .gl-container canvas").length,
       sections: [...page.querySelectorAll("section")].map(section => section.id),
       untitled: [...page.querySelectorAll("td a")].filter(a => !a.title.includes("make ")).length,
       lost: [...page.querySelectorAll("td a")].filter(
@@ -181,7 +189,7 @@ frame.addEventListener("load", () => {{
 @pytest.mark.parametrize("width", [1280, 400])
 def test_a_browser_draws_all_of_it_without_a_complaint(width, results, tmp_path):
     """In a frame of that width, as headless windows are no narrower than 500 pixels."""
-    (tmp_path / "report.html").write_text(page.build(results))
+    (tmp_path / "report.html").write_text(build_page(results))
     path = tmp_path / "frame.html"
     path.write_text(FRAME.format(width=width))
     found = subprocess.run(

@@ -6,7 +6,7 @@ import torch
 
 from corrmat.data.clouds import CloudSet
 from corrmat.data.datamodule import RegistrationDataModule
-from corrmat.data.pairs import Key, PairSettings, generator, make_pairs
+from corrmat.data.pairs import Key, PairSettings, Purpose, generator, make_pairs
 from corrmat.errors import CorrmatError
 from corrmat.ops import rigid
 
@@ -120,9 +120,32 @@ def test_outliers_are_replaced_labelled_and_otherwise_nothing_changes(clouds):
     assert torch.equal(dirty.match[~replaced], clean.match[~replaced])
 
 
+def jitter_of(clouds, **settings):
+    """The noise alone: what jitter adds to the coordinates."""
+    noisy, clean = (pairs_of(clouds, jitter=j, **settings) for j in (0.01, 0.0))
+    return noisy.source[..., :3] - clean.source[..., :3]
+
+
 def test_settings_that_are_off_do_not_shift_those_that_are_on(clouds):
+    """Every purpose draws from its own stream: switching one on moves no other."""
     plain, cropped = pairs_of(clouds), pairs_of(clouds, keep=0.5, rotation_deg=90.0)
     assert torch.equal(plain.translation, cropped.translation)
+    alone = jitter_of(clouds)
+    assert alone.abs().max() > 0.01
+    for settings in ({"outliers": 0.2}, {"corrupted": "both"}, {"keep": 1.0, "translation": 0.1}):
+        torch.testing.assert_close(jitter_of(clouds, **settings), alone, atol=1e-6, rtol=0)
+    one = pairs_of(clouds, outliers=0.2)
+    both = pairs_of(clouds, outliers=0.2, jitter=0.001, normals="estimated", stretch=1.2)
+    replaced = (one.source != plain.source).any(-1)
+    points = one.source[replaced][:, :3], both.source[replaced][:, :3]
+    torch.testing.assert_close(*points, atol=0.01, rtol=0)
+    other = pairs_of(clouds, outliers=0.2, corrupted="both")
+    assert torch.equal(one.source[replaced], other.source[replaced])
+
+
+def test_purposes_have_streams_of_their_own():
+    draws = {generator(Key(0, 0, 0, 0), purpose).random() for purpose in Purpose}
+    assert len(draws) == len(Purpose)
 
 
 def test_keys_that_differ_in_one_place_draw_differently():
@@ -192,18 +215,30 @@ def test_a_pair_does_not_depend_on_its_batch():
             torch.testing.assert_close(a[0], b, rtol=1e-6, atol=1e-6)
 
 
-def test_the_checksum_is_of_the_pairs_and_of_nothing_else():
-    known = datamodule().checksum()
-    assert datamodule(num_workers=2).checksum() == known
+def test_the_digest_is_of_the_pairs_and_of_nothing_else():
+    expected = datamodule().test_pairs_digest()
+    assert datamodule(num_workers=2).test_pairs_digest() == expected
     one = datamodule()
     one.batch_size = 1
-    assert one.checksum() == known
-    others = [datamodule(seed=1).checksum(), known, datamodule().checksum([{"rotation_deg": 9.0}])]
-    assert len(set(others)) == 3
+    assert one.test_pairs_digest() == expected
+    others = [
+        datamodule(seed=1).test_pairs_digest(),
+        datamodule().test_pairs_digest([{"rotation_deg": 9.0}]),
+        datamodule(categories=["airplane", "chair", "guitar"]).test_pairs_digest(),
+    ]
+    assert len({expected, *others}) == 4
     # The last bits of a coordinate are the machine's own.
     clouds = one.clouds("test")
     clouds.rows[:] = np.nextafter(clouds.rows, np.float32(1))
-    assert one.checksum() == known
+    assert one.test_pairs_digest() == expected
+
+
+def test_the_digest_is_of_the_shapes_too():
+    """Identical sampling: matches and transforms do not depend on the shapes at all."""
+    one, other = datamodule(), datamodule()
+    assert one.test_pairs_digest() == other.test_pairs_digest()
+    other.clouds("test").rows[:] = other.clouds("test").rows[::-1].copy()
+    assert one.test_pairs_digest() != other.test_pairs_digest()
 
 
 def test_a_tenth_of_train_is_held_out_by_seed():
@@ -231,7 +266,7 @@ def test_too_few_points_are_an_error_that_says_how_many():
 
 SCANS = {
     "keep": 0.7, "sampling": "disjoint", "jitter": 0.01, "outliers": 0.1, "outlier_distance": 0.1,
-    "spoilt": "both", "normals": "estimated",
+    "corrupted": "both", "normals": "estimated",
 }  # fmt: skip
 
 
@@ -249,7 +284,7 @@ def test_both_clouds_can_be_cropped_noisy_and_hold_outliers(clouds):
 
 
 def test_estimated_normals_come_from_the_cloud_itself(clouds):
-    from corrmat.data.normals import estimate
+    from corrmat.data.normals import estimate_normals as estimate
 
     pairs = pairs_of(clouds, **SCANS)
     for cloud in pairs.source.numpy():
@@ -259,7 +294,7 @@ def test_estimated_normals_come_from_the_cloud_itself(clouds):
 
 
 def test_spoiling_both_clouds_leaves_the_draws_of_the_source_alone(clouds):
-    one = pairs_of(clouds, **SCANS | {"spoilt": "source"})
+    one = pairs_of(clouds, **SCANS | {"corrupted": "source"})
     both = pairs_of(clouds, **SCANS)
     assert torch.equal(one.source, both.source)
     assert torch.equal(one.rotation, both.rotation)

@@ -75,7 +75,10 @@ def test_the_papers_sizes_and_optimizers():
     assert PCRNet().network.embed.layers[-2].out_features == 1024
     assert PCRNetCorr().network.embed.layers[-3].out_features == 512
     assert PCRNetCorr().network.embed.layers[0].bias is None
-    assert (PCRNet().optimizer.lr, PCRNetCorr().optimizer.weight_decay) == (1e-3, 1e-4)
+    assert (PCRNet().optimizer_settings.lr, PCRNetCorr().optimizer_settings.weight_decay) == (
+        1e-3,
+        1e-4,
+    )
 
 
 @pytest.mark.slow

@@ -12,14 +12,14 @@ import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from corrmat import metrics, registration
+from corrmat import metrics
 from corrmat.data.clouds import CloudSet
 from corrmat.data.pairs import Key, PairSettings, make_pairs
 from corrmat.data.scans import read_scan
 from corrmat.errors import CorrmatError
 from corrmat.ops import rigid
 from corrmat.ops.correspondence import MatchabilityCorrespondence, SoftCorrespondence
-from corrmat.registration import Cloud, register
+from corrmat.registration.register import Cloud, register
 
 settings.register_profile(
     "corrmat", deadline=None, suppress_health_check=list(HealthCheck), derandomize=True
@@ -128,13 +128,13 @@ def test_metrics_are_zero_for_the_truth_and_do_not_depend_on_the_frame(seed):
     st.sampled_from(["source", "both"]),
     st.floats(0, 180),
 )
-def test_pairs_are_what_their_settings_say(seed, n, keep, sampling, outliers, spoilt, degrees):
+def test_pairs_are_what_their_settings_say(seed, n, keep, sampling, outliers, corrupted, degrees):
     rng = np.random.default_rng(seed)
     rows = rng.normal(size=(2, 80, 6)).astype(np.float32) / 4
     clouds = CloudSet(rows, np.zeros(2, np.int64), ("thing",))
     try:
         how = PairSettings(
-            n, degrees, keep=keep, sampling=sampling, outliers=outliers, spoilt=spoilt
+            n, degrees, keep=keep, sampling=sampling, outliers=outliers, corrupted=corrupted
         )
     except CorrmatError:
         assert round(keep * n) < 3
@@ -143,7 +143,7 @@ def test_pairs_are_what_their_settings_say(seed, n, keep, sampling, outliers, sp
     pairs, again = (make_pairs(clouds, range(2), keys, how) for _ in range(2))
     assert torch.equal(pairs.source, again.source)
     assert pairs.source.shape[1] == round(keep * n)
-    assert pairs.target.shape[1] == (round(keep * n) if spoilt == "both" else n)
+    assert pairs.target.shape[1] == (round(keep * n) if corrupted == "both" else n)
     assert ((pairs.match >= 0) & (pairs.match <= pairs.target.shape[1])).all()
     eye = torch.eye(3).expand(2, 3, 3)
     torch.testing.assert_close(pairs.rotation @ pairs.rotation.mT, eye, atol=1e-5, rtol=0)
@@ -232,4 +232,4 @@ def test_a_mutated_file_gives_points_or_the_projects_own_error(kind, changes, sh
     assert points.shape[1] == 3
     assert points.dtype == np.float64
     with contextlib.suppress(CorrmatError):
-        registration.Cloud.of(points, "source", 0)
+        Cloud.of(points, "source", 0)

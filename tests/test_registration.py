@@ -12,11 +12,13 @@ import torch
 from conftest import shared
 
 import corrmat
-from corrmat import example, registration, view
 from corrmat.cli import main
 from corrmat.data.scans import read_scan, write_ply
-from corrmat.data.shapes import make_shape
+from corrmat.data.shapes.dataset import make_shape
 from corrmat.errors import CorrmatError
+from corrmat.registration import example
+from corrmat.registration import register as registration
+from corrmat.registration.view import registration_page
 from corrmat.weights import load_model
 
 BROWSER = next(
@@ -28,7 +30,7 @@ BROWSER = next(
 def pair(tmp_path_factory):
     """The example's two scans and their truth."""
     folder = tmp_path_factory.mktemp("pair")
-    example.write(folder)
+    example.write_example(folder)
     truth = np.array(json.loads((folder / "truth.json").read_text())["transform"])
     return folder, read_scan(folder / "source.ply"), read_scan(folder / "target.ply"), truth
 
@@ -91,7 +93,7 @@ def test_any_unit_and_place_gives_the_same_motion(pair):
 def test_detail_far_from_the_origin_is_not_lost():
     """Millimetres at coordinates of 1e7: the moved source meets the target to float64."""
     rng = np.random.default_rng(0)
-    points = make_shape("test", 3)[0][:, :3].astype(np.float64)
+    points = make_shape(("test", 3))[0][:, :3].astype(np.float64)
     rotation = registration_rotation(rng)
     source = 1000 * points + 1e7
     target = (1000 * points) @ rotation.T - 1e7
@@ -161,8 +163,8 @@ def test_clouds_that_have_nothing_in_common_are_doubtful(pair):
 def test_many_points_are_subsampled_evenly():
     cloud = np.random.default_rng(0).normal(size=(100_000, 3))
     found = registration.Cloud.of(cloud, "source", 0)
-    assert len(found.rows) == registration.FULL
-    assert len(set(found.rows.tolist())) == registration.FULL
+    assert len(found.rows) == registration.FULL_POINTS
+    assert len(set(found.rows.tolist())) == registration.FULL_POINTS
     assert np.abs(found.centre).max() < 0.03
     assert abs(np.median(found.rows) - 50_000) < 1500  # from everywhere in the file
 
@@ -231,12 +233,12 @@ def test_a_checkpoint_that_could_run_code_is_refused(tmp_path):
 
 def test_a_model_trained_anew_is_read_anew(tmp_path, monkeypatch):
     monkeypatch.setattr(registration, "load_model", lambda model: Path(model).read_text())
-    monkeypatch.setattr(registration, "Learned", lambda content: content)
+    monkeypatch.setattr(registration, "NetworkHypotheses", lambda content: content)
     path = tmp_path / "best.ckpt"
     path.write_text("first")
-    assert registration._learned(str(path)) is registration._learned(str(path))
+    assert registration._load_network(str(path)) is registration._load_network(str(path))
     path.write_text("second training")
-    assert registration._learned(str(path)) == "second training"
+    assert registration._load_network(str(path)) == "second training"
 
 
 def test_a_checkpoint_of_another_network_names_what_does_not_fit(tmp_path):
@@ -252,7 +254,7 @@ def test_a_checkpoint_of_another_network_names_what_does_not_fit(tmp_path):
 def test_the_authors_checkpoint_registers(pair):
     """DCP v1 as its authors published it, on clouds no further turned than it was trained for."""
     path = shared("reference", "dcp_v1.t7")
-    points = make_shape("test", 3)[0][:, :3].astype(np.float64)
+    points = make_shape(("test", 3))[0][:, :3].astype(np.float64)
     angle = np.radians(30)
     turn = np.array(
         [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
@@ -290,7 +292,7 @@ def test_without_open3d_the_classical_pipelines_say_what_to_install(pair, monkey
 def test_the_page_opens_in_a_browser(pair, tmp_path):
     _, source, target, _ = pair
     path = tmp_path / "view.html"
-    path.write_text(view.page(corrmat.register(source, target), source, target))
+    path.write_text(registration_page(corrmat.register(source, target), source, target))
     words = ["--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=8000"]
     words += ["--enable-logging=stderr", "--dump-dom", path.as_uri()]
     shown = subprocess.run([BROWSER, *words], capture_output=True, text=True, timeout=120)

@@ -13,9 +13,9 @@ import torch
 from conftest import ROOT
 from test_experiment import load, press_ctrl_c, train
 
-from corrmat import experiment
 from corrmat.cli import main
 from corrmat.errors import CorrmatError
+from corrmat.training import experiment
 
 STEPS = ("--trainer.max_steps", "20")
 
@@ -48,7 +48,7 @@ def assert_same_end(folder, trained, whole):
 def interrupted(folder, settings, step=5):
     with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit):  # noqa: PT012
         press_ctrl_c("training_step", step, patch)
-        train("DCP_corr", settings, folder)
+        train(settings, folder)
     signal.signal(signal.SIGINT, signal.default_int_handler)  # Lightning leaves it ignored
 
 
@@ -57,7 +57,7 @@ def whole(tmp_path_factory):
     """An arm that nothing has happened to."""
     torch.set_num_threads(1)
     folder = tmp_path_factory.mktemp("whole")
-    return train("DCP_corr", load("1.1", *STEPS).settings["DCP_corr"], folder)
+    return train(load("1.1", *STEPS).arms["DCP_corr"], folder)
 
 
 def killed(folder, after):
@@ -76,8 +76,8 @@ def test_kill_9_and_the_same_command_end_as_if_nothing_had_been(tmp_path, whole,
     killed(tmp_path, after=3)
     folder = tmp_path / "runs/smoke/shapes/1.1/DCP_corr"
     assert not (folder / "trained.json").exists()
-    trained = train("DCP_corr", load("1.1", *STEPS).settings["DCP_corr"], folder)
-    assert "going on from" in capsys.readouterr().out
+    trained = train(load("1.1", *STEPS).arms["DCP_corr"], folder)
+    assert "continuing from" in capsys.readouterr().out
     assert_same_end(folder, trained, whole)
 
 
@@ -111,48 +111,48 @@ def test_sigterm_saves_and_says_how_to_go_on(tmp_path):
     said, _ = process.communicate(timeout=60)
     assert process.returncode == 1
     assert (tmp_path / "runs/smoke/shapes/1.1/DCP_corr/last.ckpt").exists()
-    assert "the same command goes on from there" in said
+    assert "the same command continues from there" in said
     assert "Traceback" not in said
 
 
 def test_fresh_starts_anew(tmp_path, whole, capsys):
     torch.set_num_threads(1)
-    settings = load("1.1", *STEPS).settings["DCP_corr"]
+    settings = load("1.1", *STEPS).arms["DCP_corr"]
     interrupted(tmp_path / "arm", settings)
-    trained = train("DCP_corr", settings, tmp_path / "arm", fresh=True)
-    assert "going on from" not in capsys.readouterr().out
+    trained = train(settings, tmp_path / "arm", fresh=True)
+    assert "continuing from" not in capsys.readouterr().out
     assert_same_end(tmp_path / "arm", trained, whole)
 
 
 def test_a_checkpoint_cut_short_is_left_out(tmp_path, whole, capsys):
     torch.set_num_threads(1)
-    settings = load("1.1", *STEPS).settings["DCP_corr"]
+    settings = load("1.1", *STEPS).arms["DCP_corr"]
     interrupted(tmp_path / "arm", settings)
     last = tmp_path / "arm" / "last.ckpt"
     last.write_bytes(last.read_bytes()[:-1000])
-    trained = train("DCP_corr", settings, tmp_path / "arm")
+    trained = train(settings, tmp_path / "arm")
     said = capsys.readouterr().out
     assert "last.ckpt cannot be read" in said
-    assert "going on from" in said
+    assert "continuing from" in said
     assert_same_end(tmp_path / "arm", trained, whole)
 
 
 def test_a_full_disk_keeps_the_last_good_checkpoint(tmp_path, whole):
     """A limit on the size of files is what a full disk is: writing fails half way."""
     torch.set_num_threads(1)
-    settings, folder = load("1.1", *STEPS).settings["DCP_corr"], tmp_path / "arm"
+    settings, folder = load("1.1", *STEPS).arms["DCP_corr"], tmp_path / "arm"
     interrupted(folder, settings)
     before = {path.name: path.read_bytes() for path in folder.glob("*.ckpt")}
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (len(before["last.ckpt"]) // 2, hard))
     try:
         with pytest.raises(CorrmatError, match=r"File too large.*last good checkpoint: .*last"):
-            train("DCP_corr", settings, folder, logger="none")
+            train(settings, folder, logger="none")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert {path.name: path.read_bytes() for path in folder.glob("*.ckpt")} == before
     assert not list(folder.glob("*.partial"))
-    assert_same_end(folder, train("DCP_corr", settings, folder), whole)
+    assert_same_end(folder, train(settings, folder), whole)
 
 
 @pytest.mark.parametrize("option", ["--results", "--runs"])
@@ -173,8 +173,8 @@ def test_a_record_that_cannot_be_finished_leaves_whole_files(tmp_path, monkeypat
     folder = results / "smoke/shapes/3.2"
 
     def record(seed):
-        recipe = load("3.2", "--seed", seed, arms=["PCRNet_corr"])
-        return experiment.run(recipe, results, runs, "none")
+        loaded = load("3.2", "--seed", seed, arms=["PCRNet_corr"])
+        return experiment.run(loaded, results, runs, "none")
 
     def files():
         return {path.name: path.read_bytes() for path in folder.iterdir()}
@@ -195,12 +195,12 @@ def test_a_record_that_cannot_be_finished_leaves_whole_files(tmp_path, monkeypat
         record("1")
     monkeypatch.undo()
     torn = files()
-    new = json.loads(json.dumps(record("1")))
+    new = record("1")
     assert set(torn) == set(old) == set(files())
     assert all(torn[name] in (old[name], files()[name]) for name in torn)
     assert torn["metrics.json"] == old["metrics.json"]
     assert torn["per_pair.csv"] == files()["per_pair.csv"] != old["per_pair.csv"]
-    assert json.loads(files()["metrics.json"])["seed"] == new["seed"] == 1
+    assert json.loads(files()["metrics.json"])["seed"] == new.seed == 1
 
 
 def test_a_reader_that_leaves_early_gets_no_traceback():
@@ -241,12 +241,12 @@ def test_two_processes_train_as_one_does(tmp_path, launcher):
     for process in processes:
         said, _ = process.communicate(timeout=300)
         assert process.returncode == 0, said
-    found = load("2.2", *common, "--data.batch_size", "4", "--trainer.accelerator", "cpu")
+    loaded = load("2.2", *common, "--data.batch_size", "4", "--trainer.accelerator", "cpu")
     torch.set_num_threads(1)
-    alone = experiment.run(found, tmp_path / "results_1", tmp_path / "runs_1", "none")
+    alone = experiment.run(loaded, tmp_path / "results_1", tmp_path / "runs_1", "none")
     record = json.loads((tmp_path / "results/smoke/shapes/2.2/metrics.json").read_text())
-    for arm in found.settings:
-        ours, theirs = record["arms"][arm], alone["arms"][arm]
+    for arm in loaded.arms:
+        ours, theirs = record["arms"][arm], alone.arms[arm].to_json()
         assert ours["pairs_seen"] == theirs["pairs_seen"] == 32
         assert len(ours["curve"]) == len(theirs["curve"]) == 2
         for one, other in zip(ours["curve"], theirs["curve"], strict=True):

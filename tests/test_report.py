@@ -4,14 +4,26 @@ import subprocess
 import pytest
 from conftest import ROOT
 
-from corrmat import figures, report
 from corrmat.errors import CorrmatError
+from corrmat.reporting import documents, figures, tables
+from corrmat.reporting.record import Record, read_records
 
 RECORD = {
     "id": "9.9",
     "title": "a test",
     "scale": "smoke",
     "data": "shapes",
+    "family": "DCP",
+    "baseline": "DCP",
+    "treatment": "DCP_corr",
+    "controls": [],
+    "seed": 0,
+    "commit": None,
+    "hardware": {"threads": 1, "gpu": False},
+    "versions": {},
+    "test_pairs": "",
+    "bands_deg": [],
+    "baselines": {},
     "arms": {
         arm: {
             "match_accuracy": accuracy,
@@ -36,13 +48,13 @@ RECORD = {
 
 
 def test_the_table_has_ours_the_papers_and_both_ratios():
-    heads, rows = report.table(RECORD)
+    heads, rows = tables.table(Record.from_json(RECORD))
     found = {row[0]: row[1:] for row in rows}
     assert heads[1:] == ["DCP", "DCP_corr", "ratio", "paper DCP", "paper DCP_corr", "paper ratio"]
     assert found["correct matches, %"] == ["25.0", "50.0", "0.5", "5.5", "99.9", "0.0551"]
     assert found["rotation RMSE (Euler), deg"] == ["30", "3", "10", "", "", ""]
     assert "Chamfer distance (squared)" not in found  # not a number: not a row
-    shown = report.terminal_table(RECORD)
+    shown = tables.terminal_table(Record.from_json(RECORD))
     assert "32 pairs in 1.5 min" in shown
     assert len({len(line) for line in shown.splitlines() if "%" in line or "deg" in line}) == 1
 
@@ -52,7 +64,9 @@ def test_a_test_in_bands_is_summed_up_by_the_mean_of_its_bands():
     bands = {"bands": [{"relative_euler_mae_deg": 1.0}, {"relative_euler_mae_deg": 3.0}]}
     paper = {"DCP": bands, "DCP_corr": {"bands": [{"relative_euler_mae_deg": 0.5}, {}]}}
     arms = {arm: found | {"relative_euler_mae_deg": 7.0} for arm, found in RECORD["arms"].items()}
-    shown = report.markdown_summary([RECORD | {"arms": arms, "bands_deg": [0, 9], "paper": paper}])
+    shown = tables.markdown_summary(
+        [Record.from_json(RECORD | {"arms": arms, "bands_deg": [0, 9], "paper": paper})]
+    )
     ours, theirs = shown.splitlines()[2:]
     assert "| 7 → 7 |" in ours
     assert "| 2 → - |" in theirs
@@ -61,23 +75,23 @@ def test_a_test_in_bands_is_summed_up_by_the_mean_of_its_bands():
 def test_refresh_writes_between_the_marks_and_nowhere_else(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("before\n<!-- results -->\nold\n<!-- /results -->\nafter\n")
-    report.refresh(page, "results", "new")
+    documents.replace_between_marks(page, "results", "new")
     assert page.read_text() == "before\n<!-- results -->\nnew\n<!-- /results -->\nafter\n"
     with pytest.raises(CorrmatError, match="has no <!-- tables -->"):
-        report.refresh(page, "tables", "new")
+        documents.replace_between_marks(page, "tables", "new")
 
 
 def test_the_figure_is_drawn_the_same_twice(tmp_path):
     for name in ("a.png", "b.png"):
-        figures.curves_figure(RECORD, tmp_path / name)
+        figures.draw_curves(Record.from_json(RECORD), tmp_path / name)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
 def test_panels_show_training_bands_or_the_sweep():
-    shown = figures.panels(RECORD)
+    shown = figures.panels(Record.from_json(RECORD))
     assert [panel.title for panel in shown][:2] == ["training loss", "correct matches, %"]
-    assert {panel.across for panel in shown} == {"training pairs seen"}
-    matches = [(c.arm, c.paper, c.y) for c in shown[1].curves]
+    assert {panel.xlabel for panel in shown} == {"training pairs seen"}
+    matches = [(c.arm, c.paper, c.y) for c in shown[1].series]
     assert matches == [
         ("DCP", False, [10]), ("DCP", True, [5.5, 5.5]),
         ("DCP_corr", False, [10]), ("DCP_corr", True, [99.9, 99.9]),
@@ -86,33 +100,25 @@ def test_panels_show_training_bands_or_the_sweep():
     parts = [{"match_accuracy": 0.5, "relative_euler_mae_deg": 2.0, "relative_euler_rmse_deg": 3.0}]
     bands = {"bands": [{"band_deg": [0, 30]} | parts[0]]}
     arms = {arm: found | bands for arm, found in RECORD["arms"].items()}
-    shown = figures.panels(RECORD | {"arms": arms, "paper": {"DCP": bands}})
+    shown = figures.panels(Record.from_json(RECORD | {"arms": arms, "paper": {"DCP": bands}}))
     assert [panel.title for panel in shown][1] == "rotation MAE (Euler), deg"
-    assert [(c.arm, c.paper, c.x, c.y) for c in shown[1].curves] == [
+    assert [(c.arm, c.paper, c.x, c.y) for c in shown[1].series] == [
         ("DCP", False, [15], [2.0]), ("DCP", True, [15], [2.0]), ("DCP_corr", False, [15], [2.0]),
     ]  # fmt: skip
 
     sweep = {"sweep": [{"outliers": 0.4} | parts[0]]}
     arms = {arm: found | sweep for arm, found in RECORD["arms"].items()}
-    shown = figures.panels(RECORD | {"arms": arms})
-    assert [panel.across for panel in shown][3:] == ["training pairs seen"] + [
+    shown = figures.panels(Record.from_json(RECORD | {"arms": arms}))
+    assert [panel.xlabel for panel in shown][3:] == ["training pairs seen"] + [
         "outliers in the test, %"
     ] * 2
-    assert shown[-1].curves[0][2:4] == ([40], [3.0])
+    assert shown[-1].series[0][2:4] == ([40], [3.0])
 
 
 @pytest.mark.parametrize(
-    ("page", "name", "make"),
-    [
-        ("README.md", "results", lambda records, _: report.markdown_summary(records)),
-        ("docs/reproduction.md", "tables", lambda records, _: report.markdown_tables(records)),
-        ("README.md", "register", lambda _, results: report.markdown_register(results)),
-        ("docs/register.md", "networks", lambda _, results: report.markdown_networks(results)),
-        ("docs/register.md", "confidence", lambda _, results: report.markdown_confidence(results)),
-        ("docs/speed.md", "bench", lambda _, results: report.markdown_bench(results)),
-    ],
+    ("page", "name", "content"), documents.TABLES, ids=lambda value: str(value)
 )
-def test_the_documents_say_what_the_records_say(page, name, make):
+def test_the_documents_say_what_the_records_say(page, name, content):
     """Fails when a record is committed and `make docs` was not run.
 
     A record made anew in a working copy differs at least in its minutes: not a mistake.
@@ -125,9 +131,9 @@ def test_the_documents_say_what_the_records_say(page, name, make):
         pytest.skip("results/laptop is not as committed")
     text = (ROOT / page).read_text()
     shown = re.search(f"<!-- {name} -->\n(.*)\n<!-- /{name} -->", text, re.DOTALL)
-    records = report.read_records(ROOT / "results", scale="laptop")
+    records = read_records(ROOT / "results", scale="laptop")
     assert records
-    assert shown[1] == make(records, ROOT / "results")
+    assert shown[1] == content(records, ROOT / "results")
 
 
 def test_every_place_that_the_map_of_the_paper_names_is_there():

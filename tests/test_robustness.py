@@ -4,11 +4,11 @@ import math
 import pytest
 import torch
 
-from corrmat import robustness
 from corrmat.cli import main
+from corrmat.reporting import robustness
 
 
-def test_right_matches_give_the_right_rotation():
+def test_num_correct_give_the_right_rotation():
     assert robustness.wrong_matches(64, 0, 20).max() < 1e-5
     assert robustness.wrong_vector(0, 20).max() < 1e-5
 

@@ -114,8 +114,8 @@ def test_the_papers_settings():
         5,
     )
     assert network.embed.out.out_channels == 96
-    assert (RPMNet().optimizer.lr, RPMNetCorr().optimizer.lr) == (1e-4, 1e-2)
-    last = RPMNetCorr().optimizer
+    assert (RPMNet().optimizer_settings.lr, RPMNetCorr().optimizer_settings.lr) == (1e-4, 1e-2)
+    last = RPMNetCorr().optimizer_settings
     assert last.lr * last.gamma ** len(last.milestones) == pytest.approx(1e-4)
 
 
@@ -125,7 +125,7 @@ def test_rpmnet_overfits_eight_pairs(method):
     torch.manual_seed(0)
     data = RegistrationDataModule(num_points=64, batch_size=8, test_shapes=8)
     batch = next(iter(data.test_dataloader()))
-    module = method(RPMNetwork(width=32, k=8, radius=0.5, annealing_width=64)).train()
+    module = method({"width": 32, "k": 8, "radius": 0.5, "annealing_width": 64}).train()
     adam = torch.optim.Adam(module.parameters(), 2e-3)
     for _ in range(250):
         loss = module.loss(module(batch.source, batch.target), batch)

@@ -1,15 +1,18 @@
-import h5py
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
-from corrmat.data import shapes
-from corrmat.data.families import FAMILIES
+from corrmat.data import build, clouds
+from corrmat.data.shapes import dataset as shapes
+from corrmat.data.shapes.families import FAMILIES
 
 
 @pytest.mark.parametrize("name", FAMILIES)
 def test_every_family_makes_different_sound_shapes(name):
     label = list(FAMILIES).index(name)
-    made = [shapes.make_shape("train", label + turn * len(FAMILIES)) for turn in range(2)]
+    made = [shapes.make_shape(("train", label + turn * len(FAMILIES))) for turn in range(2)]
     for rows, found in made:
         assert found == label
         assert rows.shape == (2048, 6)
@@ -22,45 +25,75 @@ def test_every_family_makes_different_sound_shapes(name):
 
 def test_there_are_forty_families_and_splits_differ():
     assert len(FAMILIES) == 40
-    assert not np.array_equal(shapes.make_shape("train", 0)[0], shapes.make_shape("test", 0)[0])
+    assert not np.array_equal(shapes.make_shape(("train", 0))[0], shapes.make_shape(("test", 0))[0])
 
 
-def test_a_shape_is_the_same_again_and_whether_few_or_many_are_made(tmp_path, monkeypatch):
+def test_a_shape_is_the_same_again_and_whether_few_or_many_are_made(monkeypatch):
     few = shapes.load("test", 5)
     monkeypatch.setattr(shapes, "SIZE", {"train": 12, "test": 6})
     monkeypatch.setattr(shapes, "SMALL", 2)
     cached = shapes.load("test", 5)
-    np.testing.assert_array_equal(few.rows, cached.rows)
+    np.testing.assert_array_equal(few.rows, cached.rows[:])
     assert few.names[few.labels[1]] == "bathtub"
 
 
-def test_the_cache_is_written_whole_and_a_damaged_one_is_made_anew(monkeypatch, capsys):
+def test_the_cache_is_written_whole_and_a_damaged_shard_is_made_again(monkeypatch):
     monkeypatch.setattr(shapes, "SIZE", {"train": 8, "test": 4})
     monkeypatch.setattr(shapes, "SMALL", 0)
-    whole = shapes.load("test")
-    path = next(shapes.cache_folder().glob("*.h5"))
-    with h5py.File(path) as file:
-        assert file.attrs["version"] == shapes.fingerprint()
-    stamp = path.stat().st_mtime_ns
+    monkeypatch.setattr(build, "SHARD", 3)
+    whole = shapes.load("test").rows[:]
+    first, second = sorted(clouds.cache_folder().glob("*/shard-*.npy"))
+    stamps = [path.stat().st_mtime_ns for path in (first, second)]
     shapes.load("test")
-    assert path.stat().st_mtime_ns == stamp
+    assert [path.stat().st_mtime_ns for path in (first, second)] == stamps
 
-    with h5py.File(path, "r+") as file:
-        file["data"][0, 0, 0] += 1
-    np.testing.assert_array_equal(shapes.load("test").rows, whole.rows)
-    path.write_bytes(path.read_bytes()[:1000])
-    np.testing.assert_array_equal(shapes.load("test").rows, whole.rows)
-    assert [p.name for p in shapes.cache_folder().iterdir()] == [path.name]
+    content = bytearray(second.read_bytes())
+    content[-1] ^= 1
+    second.write_bytes(content)
+    np.testing.assert_array_equal(shapes.load("test").rows[:], whole)
+    assert first.stat().st_mtime_ns == stamps[0]
+    second.write_bytes(second.read_bytes()[:1000])
+    np.testing.assert_array_equal(shapes.load("test").rows[:], whole)
 
 
-def test_what_stops_halfway_leaves_nothing(monkeypatch, tmp_path):
+def test_what_stops_halfway_leaves_whole_shards_and_goes_on(monkeypatch):
     monkeypatch.setattr(shapes, "SIZE", {"train": 8, "test": 4})
+    monkeypatch.setattr(shapes, "SMALL", 0)
+    monkeypatch.setattr(build, "SHARD", 2)
+    original, written = build.write_shard, []
 
-    def full_disk(clouds):
-        raise OSError("no space left")
+    def interrupted(folder, number, *rest):
+        if number == 1 and not written:
+            written.append(number)
+            raise KeyboardInterrupt
+        original(folder, number, *rest)
 
-    monkeypatch.setattr(shapes, "_digest", full_disk)
-    with pytest.raises(OSError, match="no space left"):
-        shapes.build(tmp_path / "test.h5", "test")
-    assert not list(tmp_path.glob("*.h5*"))
-    assert not list(tmp_path.glob("*.partial"))
+    monkeypatch.setattr(build, "write_shard", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        shapes.load("test")
+    (first,) = clouds.cache_folder().glob("*/shard-*.npy")
+    stamp = first.stat().st_mtime_ns
+    assert not list(clouds.cache_folder().glob("*/*.partial"))
+    rows = shapes.load("test").rows[:]
+    assert first.stat().st_mtime_ns == stamp
+    np.testing.assert_array_equal(rows[3], shapes.make_shape(("test", 3))[0])
+
+
+SCRIPT = """
+from corrmat import RegistrationDataModule
+from corrmat.data.shapes import dataset
+dataset.SIZE, dataset.SMALL = {"train": 12, "test": 6}, 0
+print(len(RegistrationDataModule(data="shapes", num_points=64).train_dataloader().dataset))
+"""
+
+
+@pytest.mark.parametrize("way", ["script", "python -c"])
+def test_a_plain_script_makes_the_shapes_without_a_main_guard(way, tmp_path):
+    """Its worker processes must not run the script again."""
+    (tmp_path / "script.py").write_text(SCRIPT)
+    words = ["script.py"] if way == "script" else ["-c", SCRIPT]
+    done = subprocess.run(
+        [sys.executable, *words], cwd=tmp_path, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split()[-1] == "11"

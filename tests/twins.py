@@ -8,8 +8,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from corrmat.networks.dcp import DCPNetwork
-from corrmat.networks.dgcnn import EdgeConvolution
-from corrmat.networks.edges import Edges, Moments
 from corrmat.networks.ppf import point_pair_features
 from corrmat.networks.rpmnet import RPMNetwork
 
@@ -35,12 +33,13 @@ def cross_entropy_by_one_hot(f_x: Tensor, f_y: Tensor, scale: float, index: Tens
     return -torch.log((c * one_hot).sum(-1))
 
 
-class PlainEdgeConvolution(EdgeConvolution):
-    """Linear, batch norm, ReLU, maximum: four passes over the edges."""
-
-    def forward(self, rows: Tensor, seen: Moments | None, last: bool = False) -> Edges:
-        out = F.relu(self.norm(self.linear(rows).flatten(0, 2))).view(*rows.shape[:3], -1)
-        return Edges(None if last else out, out.amax(2), seen)
+def plain_edge_mlp(edges: Tensor, linears, norms) -> list[Tensor]:
+    """Linear, batch norm, ReLU, maximum over neighbours: four passes over edges (P, K, C)."""
+    pooled = []
+    for linear, norm in zip(linears, norms, strict=True):
+        edges = F.relu(norm(linear(edges).flatten(0, 1))).view(*edges.shape[:2], -1)
+        pooled.append(edges.amax(1))
+    return pooled
 
 
 def neighborhood_net(rows: Tensor, network) -> Tensor:

@@ -1,4 +1,4 @@
-"""What a learned network is measured against: answers that need no training."""
+"""Baselines that need no training: a learned network must beat them."""
 
 from torch import Tensor, nn
 
@@ -8,41 +8,35 @@ from corrmat.types import Prediction
 
 
 class Identity(nn.Module):
-    """Says that nothing has moved: what an error means that has not come down from it."""
+    """Identity baseline: the error that a method must beat."""
 
     def forward(self, source: Tensor, target: Tensor) -> Prediction:
-        """The identity pose of source (B, N, 3 or more); no correspondence."""
+        """Predict the identity pose for source (B, N, 3 or more); no correspondence."""
         return Prediction(*rigid.identity(source))
 
 
 class Radius(nn.Module):
     """Matches points by their distance from the origin alone.
 
-    A rotation about the origin leaves it as it is, so where there is no translation and the
-    points are identical this is right but for ties and rounding. It knows nothing of shape.
+    A rotation about the origin does not change that distance. So without a translation and with
+    identical points, this baseline is right up to ties and rounding, knowing nothing of shape.
     """
 
-    SHARPNESS = 1e12  # so that the softmax is its maximum, for radii 1e-5 apart
+    SHARPNESS = 1e12  # makes the softmax an argmax, for radii 1e-5 apart
 
     def forward(self, source: Tensor, target: Tensor) -> Prediction:
         """Register source (B, N, 3 or more) to target (B, M, 3 or more); xyz are read."""
         x, y = source[..., :3].double(), target[..., :3].double()
         r_x, r_y = x.norm(dim=-1, keepdim=True), y.norm(dim=-1, keepdim=True)
-        # -(r_x - r_y)^2 as a dot product, up to what is equal along a row.
+        # -(r_x - r_y)^2 as a dot product, up to terms that are constant along a row.
         f_x = (r_x - r_y.mean(1, keepdim=True)) * 2
         f_y = r_y - r_y.mean(1, keepdim=True)
-        c = SoftCorrespondence(_with_one(f_x), _with_square(f_y), self.SHARPNESS)
+        with_one = nn.functional.pad(f_x, (0, 1), value=1.0)
+        with_square = nn.functional.pad(f_y, (0, 1)) - nn.functional.pad(f_y.square(), (1, 0))
+        c = SoftCorrespondence(with_one, with_square, self.SHARPNESS)
         rotation, translation = rigid.procrustes(x, c.soft_target(y))
         return Prediction(rotation.to(source.dtype), translation.to(source.dtype), c)
 
 
-def _with_one(feature: Tensor) -> Tensor:
-    return nn.functional.pad(feature, (0, 1), value=1.0)
-
-
-def _with_square(feature: Tensor) -> Tensor:
-    return nn.functional.pad(feature, (0, 1)) - nn.functional.pad(feature.square(), (1, 0))
-
-
 BASELINES: dict[str, type[nn.Module]] = {"identity": Identity, "radius": Radius}
-UNTRAINED = "untrained"  # the arms' own network as it is before the first step
+UNTRAINED = "untrained"  # the baseline that is the arms' own network before training

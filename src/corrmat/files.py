@@ -1,4 +1,4 @@
-"""Writing files so that a reader never sees half of one."""
+"""Atomic writes: a reader never sees half a file."""
 
 import tempfile
 from pathlib import Path
@@ -7,12 +7,16 @@ from corrmat.errors import CorrmatError
 
 
 def replace_text(path: Path, text: str) -> None:
-    """Write beside the place, then move in."""
+    """Write text to a temporary file beside `path`, then rename it into place."""
     replace_bytes(path, text.encode())
 
 
 def replace_bytes(path: Path, content: bytes | memoryview) -> None:
-    """Write beside the place, then move in; what could not be written whole is removed."""
+    """Write bytes to a temporary file beside `path`, then rename it into place.
+
+    Raises:
+        OSError: the file cannot be written; the temporary file is removed.
+    """
     partial = path.with_name(path.name + ".partial")
     try:
         partial.write_bytes(content)
@@ -23,16 +27,16 @@ def replace_bytes(path: Path, content: bytes | memoryview) -> None:
 
 
 def ensure_writable(folder: Path) -> None:
-    """Find out now, not after an hour of training, whether files can be written to a folder.
+    """Check that files can be written to a folder, which need not exist yet.
 
-    It need not be there yet, and nothing is left behind.
+    A long run calls this first, so that it does not fail at its end. Nothing is left behind.
 
     Raises:
-        CorrmatError: they cannot.
+        CorrmatError: the folder cannot be written.
     """
-    there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    existing = next(place for place in (folder, *folder.absolute().parents) if place.exists())
     try:
-        with tempfile.NamedTemporaryFile(dir=there) as file:
+        with tempfile.NamedTemporaryFile(dir=existing) as file:
             file.write(b"corrmat")
     except OSError as error:
         raise CorrmatError(f"cannot write to {folder}: {error.strerror}") from error

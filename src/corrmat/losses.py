@@ -1,28 +1,27 @@
-"""What a method is trained on: one mixin a loss, over a plain function.
+"""Training losses: a pure function each, and a mixin that makes it a method's loss.
 
-A method is a mixin in front of `RegistrationModule`. DCP and DCP_corr differ in this one base
-class and in nothing else; RPMNet's two in their learning rate as well, PCRNet's in their network
-(paper section 5).
+A method is a loss mixin in front of `methods.Method`. DCP and DCP_corr differ in this base class
+and in nothing else. RPMNet's two methods also differ in their learning rate, and PCRNet's in their
+network (paper section 5). A mixin's hyper-parameters are the fields of its `LossSettings`; they
+form the `loss:` group of a recipe.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from corrmat.ops import rigid
 from corrmat.ops.correspondence import MatchabilityCorrespondence, SoftCorrespondence
-from corrmat.ops.neighbors import nearest, take
-from corrmat.types import PairBatch, Prediction
-
-DISCOUNT = 0.5  # of an iteration against the next
-INLIER_WEIGHT = 0.01
+from corrmat.ops.neighbors import gather_points, nearest
+from corrmat.types import MATCH_DISTANCE, PairBatch, Prediction
 
 
 def transformation_loss(
     rotation: Tensor, translation: Tensor, true_rotation: Tensor, true_translation: Tensor
 ) -> Tensor:
-    """L_DCP = ||R^T R* - I||^2 + ||t - t*||^2, both as means over elements (paper section 5.1).
+    """Compute L_DCP = ||R^T R* - I||^2 + ||t - t*||^2, means over elements (section 5.1).
 
     Args:
         rotation: (B, 3, 3) predicted.
@@ -35,16 +34,16 @@ def transformation_loss(
     """
     identity = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
     with torch.autocast(rotation.device.type, enabled=False):
-        turned = (rotation.mT @ true_rotation - identity).square().mean()
-    return turned + (translation - true_translation).square().mean()
+        rotation_loss = (rotation.mT @ true_rotation - identity).square().mean()
+    return rotation_loss + (translation - true_translation).square().mean()
 
 
 def correspondence_loss(c: SoftCorrespondence, match: Tensor) -> Tensor:
-    """L_CE: mean cross-entropy of the rows of C that have a match (paper section 4).
+    """Compute L_CE: mean cross-entropy of the rows of C that have a match (paper section 4).
 
     Args:
         c: the predicted matrix, N rows.
-        match: (B, N) int64, the class of each row; rows without one do not count.
+        match: (B, N) int64, the class of each row; rows without a class are ignored.
 
     Returns:
         A scalar.
@@ -52,29 +51,39 @@ def correspondence_loss(c: SoftCorrespondence, match: Tensor) -> Tensor:
     return c.nll(match).sum() / c.is_class(match).sum().clamp_min(1)
 
 
-def registration_loss(prediction: Prediction, batch: PairBatch) -> Tensor:
-    """One iteration of L_RPMNet: mean L1 distance of source points, and doubt (paper section 5.2).
+def registration_loss(
+    prediction: Prediction, batch: PairBatch, inlier_weight: float = 0.01
+) -> Tensor:
+    """Compute one iteration of L_RPMNet = L_reg + inlier_weight * L_inlier (paper section 5.2).
 
-    Doubt is how much the rows and columns of the matrix lack to one, on average, times 0.01:
-    RPM-Net's L_inlier, which keeps it from calling every point unmatched.
+    L_reg is the mean L1 distance of the source points under both transforms. L_inlier is the mean
+    unmatched probability of source and target points; without it, every point would be unmatched.
+
+    Args:
+        prediction: with a correspondence matrix.
+        batch: the pairs.
+        inlier_weight: weight of L_inlier.
 
     Returns:
         A scalar.
+
+    Raises:
+        ValueError: the network predicts no correspondence matrix.
     """
     if prediction.correspondence is None:
-        raise ValueError("this network predicts no correspondence to be sure of")
+        raise ValueError("RPMNet's loss needs a network that predicts a correspondence matrix")
     source = batch.source[..., :3]
     moved = rigid.apply(prediction.rotation, prediction.translation, source)
     truth = rigid.apply(batch.rotation, batch.translation, source)
     prob = prediction.correspondence.prob()
-    doubt = (1 - prob.sum(1)).mean() + (1 - prob.sum(2)).mean()
-    return (moved - truth).abs().mean() + INLIER_WEIGHT * doubt
+    unmatched_probability = (1 - prob.sum(1)).mean() + (1 - prob.sum(2)).mean()
+    return (moved - truth).abs().mean() + inlier_weight * unmatched_probability
 
 
 def chamfer_loss(moved: Tensor, target: Tensor) -> Tensor:
-    """CD: mean distance to the nearest point, there and back, not squared (paper section 5.3).
+    """Compute CD: mean distance to the nearest point, both ways, not squared (section 5.3).
 
-    Exact, with memory linear in the number of points.
+    The result is exact; memory is linear in the number of points.
 
     Args:
         moved: (B, N, 3).
@@ -83,53 +92,95 @@ def chamfer_loss(moved: Tensor, target: Tensor) -> Tensor:
     Returns:
         A scalar.
     """
-    there = moved - take(target, nearest(moved, target))
-    back = target - take(moved, nearest(target, moved))
-    return there.norm(dim=-1).mean() + back.norm(dim=-1).mean()
+    to_target = moved - gather_points(target, nearest(moved, target))
+    to_moved = target - gather_points(moved, nearest(target, moved))
+    return to_target.norm(dim=-1).mean() + to_moved.norm(dim=-1).mean()
 
 
-def mutual_matches(moved: Tensor, target: Tensor, reach: float) -> tuple[Tensor, Tensor]:
-    """Matches of two clouds that share no point: nearest to each other, and near.
+def mutual_matches(moved: Tensor, target: Tensor, max_distance: float) -> tuple[Tensor, Tensor]:
+    """Label two clouds that share no point with their mutual nearest neighbours.
 
     Args:
-        moved: (B, N, 3) source, where it truly lies.
+        moved: (B, N, 3) source points in the target's frame.
         target: (B, M, 3).
-        reach: beyond it, no match.
+        max_distance: largest distance of a match.
 
     Returns:
         Classes (B, N) of source points and (B, M) of target points: the index of the match; M
-        (or N) where nothing is in reach; -1, no class, where something is but prefers another.
+        (or N) if no point is within `max_distance`; -1, no class, if one is but its own nearest
+        neighbour is another point.
     """
-    there, back = nearest(moved, target), nearest(target, moved)
+    to_target, to_moved = nearest(moved, target), nearest(target, moved)
 
-    def classes(own: Tensor, cloud: Tensor, to: Tensor, fro: Tensor) -> Tensor:
-        near = (own - take(cloud, to)).norm(dim=-1) <= reach
-        mutual = fro.gather(1, to) == torch.arange(to.shape[1], device=to.device)
-        return torch.where(near, torch.where(mutual, to, -1), cloud.shape[1])
+    def classes(points: Tensor, cloud: Tensor, index: Tensor, back: Tensor) -> Tensor:
+        near = (points - gather_points(cloud, index)).norm(dim=-1) <= max_distance
+        mutual = back.gather(1, index) == torch.arange(index.shape[1], device=index.device)
+        return torch.where(near, torch.where(mutual, index, -1), cloud.shape[1])
 
-    return classes(moved, target, there, back), classes(target, moved, back, there)
+    return classes(moved, target, to_target, to_moved), classes(target, moved, to_moved, to_target)
 
 
 def mutual_loss(c: MatchabilityCorrespondence, matches: tuple[Tensor, Tensor]) -> Tensor:
-    """Cross-entropy over the rows and over the columns of C, as `mutual_matches` labels them."""
-    return (
-        correspondence_loss(c, matches[0]) + correspondence_loss(c.transposed(), matches[1])
-    ) / 2
+    """Compute the cross-entropy over rows and columns of C, labelled by `mutual_matches`."""
+    over_rows = correspondence_loss(c, matches[0])
+    return (over_rows + correspondence_loss(c.transposed(), matches[1])) / 2
 
 
-def discounted(losses: Sequence[Tensor]) -> Tensor:
-    """Sum over the iterations of a network, each worth half the next (RPM-Net)."""
+def discounted(losses: Sequence[Tensor], discount: float) -> Tensor:
+    """Sum losses over iterations, each weighted `discount` times the next (RPM-Net, 5.4)."""
     total = losses[0]
     for loss in losses[1:]:
-        total = DISCOUNT * total + loss
+        total = discount * total + loss
     return total
+
+
+@dataclass(frozen=True)
+class NoSettings:
+    """Settings of a loss without hyper-parameters."""
+
+
+@dataclass(frozen=True)
+class IterationSettings:
+    """Settings of a loss that is summed over iterations.
+
+    Args:
+        discount: weight of an iteration relative to the next.
+    """
+
+    discount: float = 0.5
+
+
+@dataclass(frozen=True)
+class RegistrationLossSettings(IterationSettings):
+    """Settings of RPMNet's own loss.
+
+    Args:
+        discount: weight of an iteration relative to the next.
+        inlier_weight: weight of L_inlier.
+    """
+
+    inlier_weight: float = 0.01
+
+
+@dataclass(frozen=True)
+class MutualLossSettings(IterationSettings):
+    """Settings of the loss on mutual nearest neighbours.
+
+    Args:
+        discount: weight of an iteration relative to the next.
+        max_distance: largest distance of a match, in units of the unit sphere.
+    """
+
+    max_distance: float = MATCH_DISTANCE
 
 
 class TransformationLoss:
     """Train on the error of the transform: METHOD, for DCP."""
 
+    LossSettings = NoSettings
+
     def loss(self, prediction: Prediction, batch: PairBatch) -> Tensor:
-        """`transformation_loss` of a batch."""
+        """Compute `transformation_loss` of a batch."""
         return transformation_loss(
             prediction.rotation, prediction.translation, batch.rotation, batch.translation
         )
@@ -138,44 +189,64 @@ class TransformationLoss:
 class CorrespondenceLoss:
     """Train on the correspondence matrix: METHOD_corr."""
 
+    LossSettings = IterationSettings
+    loss_settings: IterationSettings = IterationSettings()
+
     def loss(self, prediction: Prediction, batch: PairBatch) -> Tensor:
-        """`correspondence_loss` of a batch, `discounted` over iterations, if there are any."""
-        found = [step.correspondence for step in prediction.steps]
-        if None in found:
-            raise ValueError("this network predicts no correspondence to train on")
-        return discounted([correspondence_loss(c, batch.match) for c in found if c is not None])
+        """Compute `correspondence_loss` of a batch, discounted over iterations.
+
+        Raises:
+            ValueError: the network predicts no correspondence matrix.
+        """
+        matrices = [step.correspondence for step in prediction.steps]
+        if None in matrices:
+            raise ValueError("this loss needs a network that predicts a correspondence matrix")
+        losses = [correspondence_loss(c, batch.match) for c in matrices if c is not None]
+        return discounted(losses, self.loss_settings.discount)
 
 
 class MutualLoss:
-    """Train on the correspondence matrix of two clouds of which each lacks parts of the other."""
+    """Train on the correspondence matrix of two clouds that overlap in part and share no point."""
 
-    reach = 0.08  # about the distance of neighbours among 512 points of a unit ball's shape
+    LossSettings = MutualLossSettings
+    loss_settings: MutualLossSettings = MutualLossSettings()
 
     def loss(self, prediction: Prediction, batch: PairBatch) -> Tensor:
-        """`mutual_loss` of a batch, `discounted` over the layers."""
-        found = [step.correspondence for step in prediction.steps]
+        """Compute `mutual_loss` of a batch, discounted over layers.
+
+        Raises:
+            ValueError: the network predicts no matchability.
+        """
+        steps = [step.correspondence for step in prediction.steps]
+        matrices = [c for c in steps if isinstance(c, MatchabilityCorrespondence)]
+        if len(matrices) < len(steps):
+            raise ValueError("this loss needs a network that predicts matchability (LightGlue)")
         moved = rigid.apply(batch.rotation, batch.translation, batch.source[..., :3])
-        matches = mutual_matches(moved, batch.target[..., :3], self.reach)
-        known = [c for c in found if isinstance(c, MatchabilityCorrespondence)]
-        if len(known) < len(found):
-            raise ValueError("this network has no doubt about target points to train")
-        return discounted([mutual_loss(c, matches) for c in known])
+        matches = mutual_matches(moved, batch.target[..., :3], self.loss_settings.max_distance)
+        losses = [mutual_loss(c, matches) for c in matrices]
+        return discounted(losses, self.loss_settings.discount)
 
 
 class RegistrationLoss:
     """Train on distances of transformed points: METHOD, for RPMNet."""
 
+    LossSettings = RegistrationLossSettings
+    loss_settings: RegistrationLossSettings = RegistrationLossSettings()
+
     def loss(self, prediction: Prediction, batch: PairBatch) -> Tensor:
-        """`registration_loss` of a batch, `discounted` over the iterations."""
-        return discounted([registration_loss(step, batch) for step in prediction.steps])
+        """Compute `registration_loss` of a batch, discounted over iterations."""
+        weight = self.loss_settings.inlier_weight
+        losses = [registration_loss(step, batch, weight) for step in prediction.steps]
+        return discounted(losses, self.loss_settings.discount)
 
 
 class ChamferLoss:
-    """Train on the distance of the two clouds: METHOD, for PCRNet. It needs no truth."""
+    """Train on the distance of the two clouds: METHOD, for PCRNet. It needs no ground truth."""
+
+    LossSettings = NoSettings
 
     def loss(self, prediction: Prediction, batch: PairBatch) -> Tensor:
-        """`chamfer_loss` of the source, moved as predicted, and the target."""
+        """Compute `chamfer_loss` between the source under the prediction and the target."""
         source, target = batch.source[..., :3], batch.target[..., :3]
-        return chamfer_loss(
-            rigid.apply(prediction.rotation, prediction.translation, source), target
-        )
+        moved = rigid.apply(prediction.rotation, prediction.translation, source)
+        return chamfer_loss(moved, target)

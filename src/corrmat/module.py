@@ -1,10 +1,11 @@
-"""The one training, validation and test step of every method."""
+"""The Lightning module of every method: one training, validation and test step."""
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import lightning as L
 import torch
+from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
 
 from corrmat.errors import CorrmatError
@@ -23,7 +24,7 @@ class OptimizerSettings:
             "onecycle" warms up and anneals over the whole run, step by step.
         milestones: epochs.
         gamma: factor.
-        warmup: share of a one-cycle run that the rate rises in.
+        warmup: share of a one-cycle run in which the rate rises.
     """
 
     lr: float = 1e-3
@@ -40,35 +41,43 @@ class OptimizerSettings:
             "gamma": self.gamma > 0,
             "warmup": 0 < self.warmup < 1,
         }
-        for name, fine in checks.items():
-            if not fine:
+        for name, valid in checks.items():
+            if not valid:
                 raise CorrmatError(f"{name} = {getattr(self, name)} is out of range")
 
 
 class RegistrationModule(L.LightningModule):
-    """A network and its optimizer; a loss mixin in front of it makes a method.
+    """A network and its optimizer; a loss mixin of `corrmat.losses` in front makes it a method.
 
     Args:
-        network: (source, target) -> Prediction.
-        optimizer: settings.
+        network: a module that satisfies `types.RegistrationNetwork`.
+        optimizer: settings of Adam and its schedule.
     """
 
     def __init__(self, network: nn.Module, optimizer: OptimizerSettings) -> None:
         super().__init__()
         self.network = network
-        self.optimizer = optimizer
-        self.metrics = RegistrationMetrics()
+        self.optimizer_settings = optimizer
+        # Synchronised by hand: a test runs in one process, even after a distributed training.
+        self.metrics = RegistrationMetrics(sync_on_compute=False)
 
     def loss(self, prediction: Prediction, batch: PairBatch) -> Tensor:
-        """What is minimised: a mixin of `losses` says it."""
-        raise NotImplementedError(f"{type(self).__name__} has no loss mixin")
+        """Compute the training loss; a loss mixin overrides this."""
+        raise NotImplementedError(
+            f"{type(self).__name__} has no loss: name a mixin of corrmat.losses before Method "
+            "in the class's bases"
+        )
 
     def forward(self, source: Tensor, target: Tensor) -> Prediction:
-        """The network's prediction."""
+        """Predict the transforms of source (B, N, C) onto target (B, M, C)."""
         return self.network(source, target)
 
     def training_step(self, batch: PairBatch, batch_index: int) -> Tensor:
-        """One step; stops where the loss is no longer a number."""
+        """Compute the loss of a batch and log it.
+
+        Raises:
+            CorrmatError: the loss is not finite.
+        """
         prediction = self(batch.source, batch.target)
         loss = self.loss(prediction, batch)
         if not torch.isfinite(loss):
@@ -79,39 +88,50 @@ class RegistrationModule(L.LightningModule):
             )
         self.log("train/loss", loss, prog_bar=True, batch_size=len(batch))
         if prediction.correspondence is not None:
-            hits = match_accuracy(
-                prediction.correspondence.argmax(), batch.match, batch.target.shape[1]
-            )
-            self.log("train/matches", hits.mean().float(), prog_bar=True, batch_size=len(batch))
+            predicted = prediction.correspondence.argmax()
+            accuracy = match_accuracy(predicted, batch.match, batch.target.shape[1])
+            self.log("train/matches", accuracy.mean().float(), prog_bar=True, batch_size=len(batch))
         return loss
 
     def validation_step(self, batch: PairBatch, batch_index: int) -> None:
-        """Keep what was predicted."""
+        """Collect the predictions of a batch."""
         self.metrics.update(self(batch.source, batch.target), batch)
 
     def on_validation_epoch_end(self) -> None:
         """Log the metrics of all validation pairs."""
+        self._log_metrics("val")
+
+    def test_step(self, batch: PairBatch, batch_index: int) -> None:
+        """Collect the predictions of a batch."""
+        self.metrics.update(self(batch.source, batch.target), batch)
+
+    def on_test_epoch_end(self) -> None:
+        """Log the metrics of all test pairs."""
+        self._log_metrics("test")
+
+    def _log_metrics(self, stage: str) -> None:
+        """Log the metrics of all pairs seen as `<stage>/<name>`, then forget the pairs."""
+        if self.trainer.world_size > 1:
+            self.metrics.sync()
         values = self.metrics.compute()
         self.metrics.reset()
         for name, value in values.items():
-            shown = name == "rotation_error_deg_mean"
-            self.log(f"val/{name}", value, prog_bar=shown, sync_dist=True)
+            in_progress_bar = name == "rotation_error_deg_mean"
+            self.log(f"{stage}/{name}", value, prog_bar=in_progress_bar, sync_dist=True)
 
-    def test_step(self, batch: PairBatch, batch_index: int) -> None:
-        """Keep what was predicted; the caller reads `metrics` and resets it."""
-        self.metrics.update(self(batch.source, batch.target), batch)
-
-    def configure_optimizers(self) -> Any:  # noqa: ANN401 (Lightning's many forms)
-        """Adam with the schedule of the settings."""
-        how = self.optimizer
+    def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
+        """Build Adam and the schedule of its learning rate."""
+        settings = self.optimizer_settings
         adam = torch.optim.Adam(
-            self.parameters(), how.lr, weight_decay=how.weight_decay, fused=True
+            self.parameters(), settings.lr, weight_decay=settings.weight_decay, fused=True
         )
-        if how.schedule == "step":
-            rate = torch.optim.lr_scheduler.MultiStepLR(adam, list(how.milestones), how.gamma)
+        if settings.schedule == "step":
+            rate = torch.optim.lr_scheduler.MultiStepLR(
+                adam, list(settings.milestones), settings.gamma
+            )
             return {"optimizer": adam, "lr_scheduler": {"scheduler": rate, "interval": "epoch"}}
         steps = int(self.trainer.estimated_stepping_batches)
         rate = torch.optim.lr_scheduler.OneCycleLR(
-            adam, how.lr, total_steps=steps, pct_start=how.warmup
+            adam, settings.lr, total_steps=steps, pct_start=settings.warmup
         )
         return {"optimizer": adam, "lr_scheduler": {"scheduler": rate, "interval": "step"}}

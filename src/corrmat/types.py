@@ -1,12 +1,16 @@
-"""What flows between the parts: a batch of pairs, and what a network says of it."""
+"""Data that flows between the parts: a batch of pairs, and a network's prediction for it."""
 
 from dataclasses import dataclass, fields, replace
-from typing import Self
+from typing import Protocol, Self
 
 import torch
 from torch import Tensor
 
 from corrmat.ops.correspondence import SoftCorrespondence
+
+# Largest distance of matching points in two clouds that share none: about the spacing of
+# neighbours among 512 points on a shape of radius 1.
+MATCH_DISTANCE = 0.08
 
 
 @dataclass
@@ -19,15 +23,15 @@ class PairBatch:
     translation: Tensor  # (B, 3)
     match: Tensor  # (B, N) int64: index of the true match in target; M marks an outlier
     clean: Tensor  # (B, P, 3) the whole clean cloud in the source's frame, for Chamfer distances
-    shape: Tensor  # (B,) int64: which shape of the split the pair was made of
+    shape: Tensor  # (B,) int64: index of the pair's shape in its split
 
     def to(self, device: torch.device | str, **kwargs: bool) -> Self:
-        """The same batch on another device (Lightning's transfer protocol)."""
+        """Move the batch to another device (Lightning's transfer protocol)."""
         moved = {f.name: getattr(self, f.name).to(device, **kwargs) for f in fields(self)}
         return replace(self, **moved)
 
     def pin_memory(self) -> Self:
-        """The same batch in page-locked memory (the DataLoader's protocol)."""
+        """Copy the batch to page-locked memory (the DataLoader's protocol)."""
         return replace(self, **{f.name: getattr(self, f.name).pin_memory() for f in fields(self)})
 
     def __len__(self) -> int:
@@ -36,12 +40,12 @@ class PairBatch:
 
 @dataclass
 class Prediction:
-    """A network's answer for B pairs."""
+    """A network's prediction for B pairs."""
 
     rotation: Tensor  # (B, 3, 3)
     translation: Tensor  # (B, 3)
     correspondence: SoftCorrespondence | None = None  # None for networks that regress the pose
-    earlier: "tuple[Prediction, ...]" = ()  # of an iterative network: one an iteration before
+    earlier: "tuple[Prediction, ...]" = ()  # predictions of the iterations before, if any
 
     @property
     def steps(self) -> "list[Prediction]":
@@ -49,7 +53,18 @@ class Prediction:
         return [*self.earlier, self]
 
 
-def with_earlier(steps: list[Prediction]) -> Prediction:
-    """The last of an iterative network's predictions, which knows those before it."""
+def last_of(steps: list[Prediction]) -> Prediction:
+    """Return the last prediction of an iterative network, with the earlier ones attached."""
     *earlier, last = steps
     return replace(last, earlier=tuple(earlier))
+
+
+class RegistrationNetwork(Protocol):
+    """A network that a method can train: an `nn.Module` with these two members."""
+
+    min_points: int
+    """Fewest points of a cloud that the network can process."""
+
+    def __call__(self, source: Tensor, target: Tensor) -> Prediction:
+        """Register source (B, N, C) to target (B, M, C); C = 3, or 6 with unit normals."""
+        ...

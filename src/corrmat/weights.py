@@ -1,6 +1,6 @@
 """Trained networks: the shipped one, this project's checkpoints, and the original authors'.
 
-Nothing here executes what a file says: tensors are read by safetensors or by torch's loader for
+Nothing here executes code from a file: tensors are read by safetensors, or by torch's loader for
 weights only, which refuses every other kind of object.
 """
 
@@ -8,13 +8,14 @@ import json
 import pickle
 import re
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+import numpy as np
 import safetensors
 import safetensors.torch
 import torch
-import yaml
 from torch import Tensor, nn
 
 from corrmat.errors import CorrmatError
@@ -25,7 +26,7 @@ from corrmat.networks.rpmnet import RPMNetwork
 
 State = dict[str, Tensor]
 
-# Their names to ours, rewritten in this order.
+# The original authors' names to ours, rewritten in this order.
 _RULES: dict[str, tuple[tuple[str, str], ...]] = {
     "dcp": (
         (r"^emb_nn\.conv5\.", "embed.fuse."),
@@ -63,7 +64,7 @@ _RULES: dict[str, tuple[tuple[str, str], ...]] = {
         *((rf"^emb_nn\.bn{i + 1}\.", f"embed.layers.{3 * i + 1}.") for i in range(5)),
     ),
 }
-_LEFT_OUT = ("head.reflect",)  # a constant of the originals' SVD head
+_IGNORED = ("head.reflect",)  # a constant of the originals' SVD head
 
 
 def load_reference(kind: str, state_dict: Mapping[str, Any], **hparams: Any) -> nn.Module:  # noqa: ANN401
@@ -84,95 +85,135 @@ def load_reference(kind: str, state_dict: Mapping[str, Any], **hparams: Any) -> 
         CorrmatError: unknown kind, or the parameters do not fit; the message lists them.
     """
     if kind not in _BUILD:
-        raise CorrmatError(f"no reference network of kind {kind!r}; known: {', '.join(_BUILD)}")
+        raise CorrmatError(f"no reference network of kind {kind!r}; kinds: {', '.join(_BUILD)}")
     ours = {
         rename(kind, name): torch.as_tensor(value)
         for name, value in state_dict.items()
-        if name not in _LEFT_OUT
+        if name not in _IGNORED
     }
-    return _filled(_BUILD[kind](ours, hparams), ours)
+    return _load_state(_BUILD[kind](ours, hparams), ours)
 
 
 SHIPPED = Path(__file__).parent / "shipped" / "corrmat.safetensors"
 
 
 def load_model(model: str | Path = "corrmat") -> nn.Module:
-    """A trained network, in evaluation mode.
+    """Load a trained network, in evaluation mode.
 
     Args:
         model: "corrmat" for the weights that ship with the package; or a file: a checkpoint of
-            `corrmat fit` (with its settings.yaml beside it), or the original authors' .t7 or
-            .pth of DCP, RPMNet, PCRNet or PCRNet_corr.
+            `corrmat fit`, or the original authors' .t7 or .pth of DCP, RPMNet, PCRNet or
+            PCRNet_corr.
 
     Raises:
         CorrmatError: there is no such file, it holds anything but tensors, or they fit no
-            network; the message says which do not.
+            network; the message names those that do not.
     """
     if str(model) == "corrmat":
-        network = InvariantNetwork(**json.loads(shipped_about()["network"]))
-        return _filled(network, safetensors.torch.load_file(SHIPPED))
+        network = InvariantNetwork(**json.loads(shipped_metadata()["network"]))
+        return _load_state(network, safetensors.torch.load_file(SHIPPED))
     path = Path(model)
-    state = _tensors(path)
-    if state and all(name.startswith("network.") for name in state):
-        return own_checkpoint(path)[2]
+    content = _read_checkpoint(path)
+    if "method" in content:
+        return checkpoint_network(path)[2]
+    state = _tensors(path, content)
     return load_reference(_kind_of(path, state), state)
 
 
-def shipped_about() -> dict[str, str]:
-    """What the shipped weights say of themselves: method, network, commit, calibration."""
+def shipped_metadata() -> dict[str, str]:
+    """Read the header of the shipped weights: method, network, commit, calibration."""
     with safetensors.safe_open(SHIPPED, framework="pt") as file:
         return file.metadata()
 
 
-def _tensors(path: Path) -> State:
+@dataclass(frozen=True)
+class Calibration:
+    """Logistic curves from the scores of a registration to the chance that it is right.
+
+    Coefficients are over (agreement, support, 1), and over (agreement, 1) for models without
+    matches; `registration.shipping.calibrate` fits them.
+    """
+
+    both: list[float]
+    agreement: list[float]
+
+    def confidence(self, agreement: float, support: float | None) -> float:
+        """Compute the chance that a registration is right.
+
+        Args:
+            agreement: of the two clouds, in [0, 1].
+            support: of the matches, in [0, 1]; None for a model without matches.
+        """
+        if support is None:
+            logit = np.dot(self.agreement, [agreement, 1.0])
+        else:
+            logit = np.dot(self.both, [agreement, support, 1.0])
+        return float(1 / (1 + np.exp(-logit)))
+
+
+def shipped_calibration() -> Calibration:
+    """Read the calibration of the shipped weights."""
+    return Calibration(**json.loads(shipped_metadata()["calibration"]))
+
+
+def _read_checkpoint(path: Path) -> Mapping[str, Any]:
+    """Read a file with torch's loader for weights only."""
     if not path.is_file():
         raise CorrmatError(
             f"no model {str(path)!r}: neither corrmat, icp, ransac, fgr nor a checkpoint file"
         )
     try:
-        found = torch.load(path, map_location="cpu", weights_only=True)
+        content = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
         raise CorrmatError(
             f"{path} is no checkpoint of tensors alone; nothing else is ever loaded"
         ) from error
-    # Unpicklers fail in every way there is on a file that is none of theirs.
-    except Exception as error:
+    except Exception as error:  # unpickling a file of another kind raises errors of every type
         raise CorrmatError(f"{path} is no checkpoint, or cut short") from error
-    for key in ("state_dict", "model", "model_state_dict"):
-        if isinstance(found, Mapping) and isinstance(found.get(key), Mapping):
-            found = found[key]
-    if not isinstance(found, Mapping) or not found:
+    if not isinstance(content, Mapping) or not content:
         raise CorrmatError(f"{path} holds no parameters by name")
-    tensors = {str(k): v for k, v in found.items() if isinstance(v, Tensor)}
+    return content
+
+
+def _tensors(path: Path, content: Mapping[str, Any]) -> State:
+    """Find the named tensors in the content of a checkpoint."""
+    for key in ("state_dict", "model", "model_state_dict"):
+        if isinstance(content.get(key), Mapping):
+            content = content[key]
+    tensors = {str(k): v for k, v in content.items() if isinstance(v, Tensor)}
+    if not tensors:
+        raise CorrmatError(f"{path} holds no parameters by name")
     return {name.removeprefix("module."): value for name, value in tensors.items()}
 
 
-def own_checkpoint(path: Path) -> tuple[str, dict[str, Any], nn.Module]:
-    """Method, hyper-parameters and network of a checkpoint of `corrmat fit`.
+def checkpoint_network(path: Path) -> tuple[str, dict[str, Any], nn.Module]:
+    """Load the method's name, the network's hyper-parameters and the network of a checkpoint.
+
+    Args:
+        path: a checkpoint of `corrmat fit`, or of a Lightning Trainer and a method of ours.
 
     Raises:
-        CorrmatError: settings.yaml is not beside it, or it does not fit.
+        CorrmatError: the method is unknown, or the parameters do not fit.
     """
-    from corrmat.methods import METHODS  # brings Lightning, for which register does not wait
+    from corrmat.methods import METHODS  # imports Lightning, which `register` does not need
 
-    settings = path.parent / "settings.yaml"
-    if not settings.is_file():
-        raise CorrmatError(f"{path} is a checkpoint of corrmat, but {settings} is not beside it")
-    try:
-        about = yaml.safe_load(settings.read_text())
-        method, hparams = about["method"], about["network"]
-        network = METHODS[method].network_type(**hparams)
-    except (yaml.YAMLError, KeyError, TypeError, ValueError) as error:
-        raise CorrmatError(f"{settings} does not say which network {path} is of") from error
-    own = {
+    content = _read_checkpoint(path)
+    classes = {method.__name__: method for method in METHODS.values()}
+    method = cast("str", content.get("method"))
+    if method not in classes:
+        raise CorrmatError(f"{path} is of method {method!r}; methods: {', '.join(classes)}")
+    hparams = content["hyper_parameters"]["network"]
+    network = classes[method].network_type(**hparams)
+    state = {
         name.removeprefix("network."): value
-        for name, value in _tensors(path).items()
+        for name, value in _tensors(path, content).items()
         if name.startswith("network.")
     }
-    return method, hparams, _filled(network, own)
+    return method, hparams, _load_state(network, state)
 
 
 def _kind_of(path: Path, state: State) -> str:
+    """Recognise the original authors' network by the names of its parameters."""
     if "feat_extractor.prepool.0.weight" in state:
         return "rpmnet"
     if "feature_model.conv1.weight" in state:
@@ -187,14 +228,15 @@ def _kind_of(path: Path, state: State) -> str:
 
 
 def rename(kind: str, name: str) -> str:
-    """What one of the original's parameters is called here."""
+    """Translate the name of one of the original's parameters to ours."""
     for pattern, replacement in _RULES[kind]:
         name = re.sub(pattern, replacement, name)
     return name
 
 
 def _dcp(state: State, hparams: dict[str, Any]) -> nn.Module:
-    fuse = _known(state, "embed.fuse.weight", "a DCP", "emb_nn.conv5.weight")
+    """Build DCP for a state; sizes default to the tensors'."""
+    fuse = _required(state, "embed.fuse.weight", "a DCP", "emb_nn.conv5.weight")
     hidden = state.get("pointer.encoder.feedforward.0.weight")
     return DCPNetwork(
         width=hparams.get("emb_dims", len(fuse)),
@@ -206,27 +248,28 @@ def _dcp(state: State, hparams: dict[str, Any]) -> nn.Module:
 
 
 def _rpmnet(state: State, hparams: dict[str, Any]) -> nn.Module:
-    out = _known(state, "embed.out.weight", "an RPMNet", "feat_extractor.postpool.6.weight")
-    turns = hparams.get("num_iter")
-    slack = str(hparams.get("slack", "both")).split()[0]  # RPM-Net's own; a remark may follow
+    """Build RPMNet for a state; sizes default to the tensors'."""
+    out = _required(state, "embed.out.weight", "an RPMNet", "feat_extractor.postpool.6.weight")
+    iterations = hparams.get("num_iter")
+    slack = str(hparams.get("slack", "both")).split()[0]  # RPM-Net's default; a remark may follow
     return RPMNetwork(
         width=hparams.get("feat_dim", len(out)),
         k=hparams.get("num_neighbors", 64),
         radius=hparams.get("radius", 0.3),
-        iterations=turns or 2,
-        test_iterations=turns or 5,
+        iterations=iterations or 2,
+        test_iterations=iterations or 5,
         sinkhorn_iterations=hparams.get("num_sk_iter", 5),
         slack=slack,  # type: ignore[arg-type]
     )
 
 
 def _pcrnet(state: State, hparams: dict[str, Any]) -> nn.Module:
-    last = _known(state, "embed.layers.8.weight", "a PCRNet", "feature_model.conv5.weight")
+    last = _required(state, "embed.layers.8.weight", "a PCRNet", "feature_model.conv5.weight")
     return PCRNetwork(hparams.get("emb_dims", len(last)), hparams.get("iterations", 8))
 
 
 def _pcrnet_corr(state: State, hparams: dict[str, Any]) -> nn.Module:
-    last = _known(state, "embed.layers.12.weight", "a PCRNet_corr", "emb_nn.conv5.weight")
+    last = _required(state, "embed.layers.12.weight", "a PCRNet_corr", "emb_nn.conv5.weight")
     return PCRNetCorrNetwork(hparams.get("emb_dims", len(last)))
 
 
@@ -238,13 +281,14 @@ _BUILD: dict[str, Callable[[State, dict[str, Any]], nn.Module]] = {
 }
 
 
-def _known(state: State, name: str, what: str, theirs: str) -> Tensor:
+def _required(state: State, name: str, what: str, theirs: str) -> Tensor:
     if name not in state:
         raise CorrmatError(f"not {what} checkpoint: {theirs} is missing")
     return state[name]
 
 
-def _filled(network: nn.Module, state: State) -> nn.Module:
+def _load_state(network: nn.Module, state: State) -> nn.Module:
+    """Load a state into a network, or name every parameter that does not fit."""
     expected = network.state_dict()
     wrong = [f"{name} is missing" for name in expected if name not in state]
     wrong += [f"{name} is unknown" for name in state if name not in expected]
@@ -254,14 +298,14 @@ def _filled(network: nn.Module, state: State) -> nn.Module:
         if name in state and _shape(state[name]) != _shape(tensor)
     ]
     if wrong:
-        shown = "; ".join(wrong[:8]) + (f"; and {len(wrong) - 8} more" if len(wrong) > 8 else "")
-        raise CorrmatError(f"the checkpoint does not fit: {shown}")
-    network.load_state_dict({name: state[name].view_as(own) for name, own in expected.items()})
+        more = f"; and {len(wrong) - 8} more" if len(wrong) > 8 else ""
+        raise CorrmatError(f"the checkpoint does not fit: {'; '.join(wrong[:8])}{more}")
+    network.load_state_dict({name: state[name].view_as(t) for name, t in expected.items()})
     return network.eval()
 
 
 def _shape(tensor: Tensor) -> tuple[int, ...]:
-    """Without the ones at the end, by which a 1 x 1 convolution differs from a linear layer."""
+    """Drop trailing ones, by which a 1 x 1 convolution differs from a linear layer."""
     shape = list(tensor.shape)
     while shape and shape[-1] == 1:
         shape.pop()

@@ -1,1 +1,1 @@
-"""Sources of shapes, and the pairs that are made of them."""
+"""Data sets of shapes, and the pairs of clouds that are drawn from them."""

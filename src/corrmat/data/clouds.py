@@ -1,114 +1,196 @@
-"""A set of clean clouds, and the HDF5 layout in which they are kept (ModelNet40's official one)."""
+"""A set of clean clouds, in memory or in shards on disk."""
 
+import json
 import logging
-from collections.abc import Sequence
+import os
+import zlib
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import h5py
 import numpy as np
+import platformdirs
 
-from corrmat.data.normals import estimate
 from corrmat.errors import CorrmatError
+from corrmat.files import replace_text
 
-log = logging.getLogger(__name__)
+log = logging.getLogger("corrmat")
+_INDEX = "index.json"  # written last: a folder without it is not complete
+
+
+class ShardedRows:
+    """Rows (S, P, 6) in .npy shards, of which only the requested ones are read.
+
+    Reading a shape is one `pread` of some 50 KB. The operating system caches the files, so that
+    memory of the process does not grow with the data set, and any number of DataLoader workers
+    share one copy.
+    """
+
+    def __init__(self, files: Sequence[Path], index: np.ndarray | None = None) -> None:
+        headers = [np.load(file, mmap_mode="r") for file in files]
+        self._files, self._offsets = tuple(files), [header.offset for header in headers]
+        self._starts = np.cumsum([0, *(len(header) for header in headers)])
+        self._row_shape = headers[0].shape[1:]
+        self._index = np.arange(self._starts[-1]) if index is None else index
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(S, P, 6), as an array's."""
+        return len(self._index), *self._row_shape
+
+    def __len__(self) -> int:
+        return len(self._index)
+
+    def __getitem__(self, key: np.ndarray | slice | Sequence[int] | int) -> np.ndarray:
+        chosen = self._index[key]
+        if np.ndim(chosen) == 0:
+            return self._read(int(chosen))
+        return np.stack([self._read(int(i)) for i in chosen])
+
+    def select(self, key: np.ndarray | slice) -> "ShardedRows":
+        """Return a subset without reading it."""
+        subset = object.__new__(ShardedRows)
+        subset.__dict__ |= self.__dict__
+        subset._index = self._index[key]
+        return subset
+
+    def _read(self, position: int) -> np.ndarray:
+        """Read the row at a position of the whole set, (P, 6)."""
+        shard = int(np.searchsorted(self._starts, position, "right")) - 1
+        size = int(np.prod(self._row_shape))
+        skip = self._offsets[shard] + 4 * size * (position - int(self._starts[shard]))
+        values = np.fromfile(self._files[shard], np.float32, size, offset=skip)
+        return values.reshape(self._row_shape)
 
 
 @dataclass(frozen=True)
 class CloudSet:
-    """S clean clouds of P points each, centred, in the unit sphere. Nobody writes into them."""
+    """S clean clouds of P points each, centred, inside the unit sphere; read-only."""
 
-    rows: np.ndarray  # (S, P, 6) float32: xyz and unit normal of every point
+    rows: np.ndarray | ShardedRows  # (S, P, 6) float32: xyz and unit normal of every point
     labels: np.ndarray  # (S,) int64, index into names
     names: tuple[str, ...]  # categories
-
-    @property
-    def points(self) -> np.ndarray:
-        """(S, P, 3) coordinates."""
-        return self.rows[..., :3]
-
-    @property
-    def normals(self) -> np.ndarray:
-        """(S, P, 3) unit normals."""
-        return self.rows[..., 3:]
 
     def __len__(self) -> int:
         return len(self.rows)
 
-    def take(self, index: np.ndarray | slice) -> "CloudSet":
-        """The shapes at these positions."""
-        return CloudSet(self.rows[index], self.labels[index], self.names)
+    @property
+    def num_points(self) -> int:
+        """P."""
+        return self.rows.shape[1]
+
+    def select(self, key: np.ndarray | slice) -> "CloudSet":
+        """Return the shapes at these positions."""
+        rows = self.rows
+        rows = rows.select(key) if isinstance(rows, ShardedRows) else rows[key]
+        return CloudSet(rows, self.labels[key], self.names)
 
     def only(self, categories: Sequence[str]) -> "CloudSet":
-        """The shapes of these categories.
+        """Return the shapes of these categories.
 
         Raises:
             CorrmatError: a category is unknown, or no shape is left.
         """
         for name in categories:
             if name not in self.names:
-                raise CorrmatError(f"unknown category {name!r}; known: {', '.join(self.names)}")
+                raise CorrmatError(
+                    f"unknown category {name!r}; categories: {', '.join(self.names)}"
+                )
         wanted = [self.names.index(name) for name in categories]
-        kept = self.take(np.flatnonzero(np.isin(self.labels, wanted)))
-        if not len(kept):
+        selected = self.select(np.flatnonzero(np.isin(self.labels, wanted)))
+        if not len(selected):
             raise CorrmatError(f"no shape of {', '.join(categories)} in this data set")
-        return kept
+        return selected
+
+    def checksum(self) -> str:
+        """Compute a CRC of labels and of up to 256 shapes: which data a network was trained on."""
+        spread = np.linspace(0, len(self) - 1, min(256, len(self))).round().astype(int)
+        crc = zlib.crc32(np.ascontiguousarray(self.labels).data)
+        return f"{zlib.crc32(np.ascontiguousarray(self.rows[spread]).data, crc):08x}"
 
 
-def read_hdf5(path: Path, names: tuple[str, ...]) -> CloudSet:
-    """Read one file of the official layout: `data`, `normal`, `label`.
+def cache_folder() -> Path:
+    """Return `$CORRMAT_CACHE`, or the user's cache folder."""
+    return Path(os.environ.get("CORRMAT_CACHE") or platformdirs.user_cache_dir("corrmat"))
 
-    A file without `normal` gets estimated ones, and a warning says so.
 
-    Raises:
-        CorrmatError: the file is missing, cut short, lacks an array, or holds NaN points.
+def write_shard(
+    folder: Path, number: int, rows: np.ndarray, labels: np.ndarray, skipped: Sequence[str] = ()
+) -> None:
+    """Write one shard, so that it is there whole or not at all.
+
+    Args:
+        folder: of the data set's split.
+        number: of the shard.
+        rows: (n, P, 6) float32; n may be 0.
+        labels: (n,).
+        skipped: what could not be read, a line each.
     """
-    if not path.is_file():
-        raise CorrmatError(f"{path} is missing; fetch the data set again")
+    folder.mkdir(parents=True, exist_ok=True)
+    path = _shard(folder, number)
+    partial = path.with_suffix(f".{os.getpid()}.partial")
     try:
-        with h5py.File(path) as file:
-            points = np.asarray(file["data"], np.float32)
-            normals = np.asarray(file["normal"], np.float32) if "normal" in file else None
-            labels = np.asarray(file["label"], np.int64).reshape(-1)
-    except KeyError as error:
-        raise CorrmatError(f"{path} lacks an array of the official layout: {error}") from error
-    except OSError as error:
-        raise CorrmatError(
-            f"{path} is not readable HDF5 (cut short?), fetch it again: {error}"
-        ) from error
-    shapes = points.shape, points.shape if normals is None else normals.shape
-    if points.ndim != 3 or points.shape[2] != 3 or shapes[0] != shapes[1]:
-        raise CorrmatError(
-            f"{path}: data {shapes[0]} and normal {shapes[1]} are not both (S, P, 3)"
-        )
-    if len(labels) != len(points) or (
-        len(labels) and not 0 <= labels.min() <= labels.max() < len(names)
-    ):
-        raise CorrmatError(f"{path}: labels do not fit {len(points)} shapes of {len(names)} names")
-    _all_finite(points, "points", path)
-    if normals is None:
-        log.warning("%s has no normals: estimated from neighbouring points, facing outwards", path)
-        normals = np.stack([estimate(cloud) for cloud in points]) if len(points) else points
-    _all_finite(normals, "normals", path)
-    return CloudSet(np.concatenate([points, normals], -1), labels, names)
+        with partial.open("wb") as file:
+            np.save(file, np.ascontiguousarray(rows, np.float32))
+        about = {"labels": labels.tolist(), "crc32": _crc(partial), "skipped": list(skipped)}
+        partial.replace(path)
+        replace_text(path.with_suffix(".json"), json.dumps(about))
+    finally:
+        partial.unlink(missing_ok=True)
 
 
-def _all_finite(array: np.ndarray, kind: str, path: Path) -> None:
-    bad = np.flatnonzero(~np.isfinite(array).all((1, 2)))
-    if len(bad):
-        raise CorrmatError(f"{path}: shape {bad[0]} has NaN or infinite {kind}; remove or mend it")
+def missing_shards(folder: Path, count: int) -> list[int]:
+    """List the shards, of `count`, that are not there yet."""
+    return [n for n in range(count) if not _shard(folder, n).with_suffix(".json").is_file()]
 
 
-def concatenate(parts: Sequence[CloudSet]) -> CloudSet:
-    """Several sets of the same categories as one.
+def finish_shards(folder: Path, names: Sequence[str], count: int) -> None:
+    """Mark a folder of `count` shards as complete."""
+    abouts = [json.loads(_shard(folder, n).with_suffix(".json").read_text()) for n in range(count)]
+    replace_text(folder / _INDEX, json.dumps({"names": list(names), "shards": abouts}))
 
-    Raises:
-        CorrmatError: they differ in their number of points.
+
+def open_shards(folder: Path) -> CloudSet | None:
+    """Open a complete folder of shards; None if it is incomplete or damaged.
+
+    A damaged shard is deleted, so that only this one has to be made again.
     """
-    if len({part.rows.shape[1] for part in parts}) > 1:
-        raise CorrmatError("the files of this data set differ in their number of points a cloud")
-    return CloudSet(
-        np.concatenate([part.rows for part in parts]),
-        np.concatenate([part.labels for part in parts]),
-        parts[0].names,
-    )
+    if not (folder / _INDEX).is_file():
+        return None
+    index = json.loads((folder / _INDEX).read_text())
+    damaged = [
+        n for n, about in enumerate(index["shards"]) if _crc(_shard(folder, n)) != about["crc32"]
+    ]
+    if damaged:
+        log.warning("%s: %d damaged shards are made again", folder, len(damaged))
+        (folder / _INDEX).unlink()
+        for number in damaged:
+            _shard(folder, number).with_suffix(".json").unlink(missing_ok=True)
+        return None
+    filled = [n for n, about in enumerate(index["shards"]) if about["labels"]]
+    labels = [label for about in index["shards"] for label in about["labels"]]
+    if not filled:
+        raise CorrmatError(f"{folder.name} holds no shapes")
+    rows = ShardedRows([_shard(folder, n) for n in filled])
+    return CloudSet(rows, np.array(labels, np.int64), tuple(index["names"]))
+
+
+def skipped_shapes(folder: Path) -> Iterator[str]:
+    """Yield a line for every shape that could not be read when the shards were made."""
+    for about in json.loads((folder / _INDEX).read_text())["shards"]:
+        yield from about["skipped"]
+
+
+def _shard(folder: Path, number: int) -> Path:
+    return folder / f"shard-{number:05d}.npy"
+
+
+def _crc(path: Path) -> int | None:
+    """Compute the CRC-32 of a file in slices; None if it is missing."""
+    if not path.is_file():
+        return None
+    crc = 0
+    with path.open("rb") as file:
+        while content := file.read(2**22):
+            crc = zlib.crc32(content, crc)
+    return crc

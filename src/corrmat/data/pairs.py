@@ -1,12 +1,14 @@
-"""A clean cloud becomes a pair of clouds with its truth (paper section 5).
+"""A clean cloud becomes a pair of clouds with its ground truth (paper section 5).
 
-Chance and geometry are kept apart. Everything random about one pair is drawn by `draw`
-from a generator keyed by (seed, stream, epoch, index), so a pair does not depend on the
-batch, worker or machine that makes it; everything geometric is done for a whole batch.
+Randomness and geometry are separate. `_draw` draws everything random about one pair from
+generators keyed by (seed, stream, epoch, index) and purpose. So a pair does not depend on the
+batch, worker or machine that makes it, and switching one corruption on does not change another.
+All geometry is computed for a whole batch.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -15,10 +17,10 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from corrmat.data.clouds import CloudSet
-from corrmat.data.normals import estimate
+from corrmat.data.normals import estimate_normals
 from corrmat.errors import CorrmatError
 from corrmat.ops import rigid
-from corrmat.types import PairBatch
+from corrmat.types import MATCH_DISTANCE, PairBatch
 
 Sampling = Literal["identical", "independent", "disjoint"]
 Split = Literal["train", "val", "test"]
@@ -27,29 +29,28 @@ STREAM: dict[Split, int] = {"train": 0, "val": 1, "test": 2}
 
 @dataclass(frozen=True)
 class PairSettings:
-    """How a pair is drawn.
+    """How pairs are drawn.
 
     Args:
         num_points: N, points taken of the clean cloud for each of source and target.
         rotation_deg: the angle is uniform in [-rotation_deg, rotation_deg], about an axis
             uniform on the sphere (so 180 is not Haar measure).
-        min_rotation_deg: angles nearer to zero than this are left out (tables 1 and 2).
+        min_rotation_deg: smallest absolute angle (tables 1 and 2).
         translation: uniform in [-translation, translation]^3; clouds have radius 1.
-        keep: share of the source's points that stay after a crop by a plane.
+        keep: share of the points kept by a crop with a plane.
         sampling: "identical": both clouds are the same points; "independent": two draws
             that may share points; "disjoint": two draws that share none.
         jitter: standard deviation of Gaussian noise on every coordinate of both clouds.
-        outliers: share of source points replaced by uniform points of a unit cube.
-        outlier_distance: with outliers, a source point farther than this from every target
-            point is labelled an outlier. Inliers of identical sampling lie at 0, and a
-            random point of the cube lies nearer than this to a surface only where it
-            might as well be a surface point.
-        spoilt: which clouds are cropped and get outliers. With "both", a source point whose
+        outliers: share of points replaced by uniform points of a unit cube.
+        outlier_distance: if points may have no match, a source point farther than this from
+            every target point is labelled an outlier. None for 0.05 with identical sampling,
+            where inliers lie at 0, and else `types.MATCH_DISTANCE`.
+        corrupted: which clouds are cropped and get outliers. With "both", a source point whose
             surface the target lacks is labelled an outlier too.
-        normals: "given" with the clean cloud, or "estimated" from each spoilt one.
-        stretch: every axis of a shape is drawn out by a factor of up to this and at least its
-            inverse, and half of the shapes are mirrored: other shapes of the same kind, for
-            training. 1 leaves them alone; only with estimated normals.
+        normals: "given" with the clean cloud, or "estimated" from each corrupted one.
+        stretch: augmentation of training shapes: every axis is scaled by a factor between
+            1 / stretch and stretch, and half of the shapes are mirrored. 1 switches it off;
+            otherwise normals must be estimated.
     """
 
     num_points: int = 512
@@ -60,8 +61,8 @@ class PairSettings:
     sampling: Sampling = "identical"
     jitter: float = 0.0
     outliers: float = 0.0
-    outlier_distance: float = 0.05
-    spoilt: Literal["source", "both"] = "source"
+    outlier_distance: float | None = None
+    corrupted: Literal["source", "both"] = "source"
     normals: Literal["given", "estimated"] = "given"
     stretch: float = 1.0
 
@@ -74,11 +75,11 @@ class PairSettings:
             "keep": 0 < self.keep <= 1 and round(self.keep * self.num_points) >= 3,
             "jitter": self.jitter >= 0,
             "outliers": 0 <= self.outliers < 1,
-            "outlier_distance": self.outlier_distance > 0,
+            "outlier_distance": self.outlier_distance is None or self.outlier_distance > 0,
             "stretch": self.stretch == 1 or (self.stretch > 1 and self.normals == "estimated"),
         }
-        for name, fine in checks.items():
-            if not fine:
+        for name, valid in checks.items():
+            if not valid:
                 raise CorrmatError(f"{name} = {getattr(self, name)} is out of range")
 
     @property
@@ -87,18 +88,43 @@ class PairSettings:
         return round(self.keep * self.num_points)
 
     @property
-    def unmatched(self) -> bool:
+    def min_cloud_points(self) -> int:
+        """Points that a clean cloud must have."""
+        return (2 if self.sampling == "disjoint" else 1) * self.num_points
+
+    @property
+    def has_outliers(self) -> bool:
         """Whether a source point may have no match."""
-        return bool(self.outliers) or self.spoilt == "both"
+        return bool(self.outliers) or self.corrupted == "both"
+
+    @property
+    def max_match_distance(self) -> float:
+        """Distance beyond which a source point has no match; infinite if every point has one."""
+        if not self.has_outliers:
+            return np.inf
+        if self.outlier_distance is not None:
+            return self.outlier_distance
+        return 0.05 if self.sampling == "identical" else MATCH_DISTANCE
 
 
 class Key(NamedTuple):
-    """Names one pair: its chance is a pure function of (seed, stream, epoch, index)."""
+    """Key of a pair: its randomness is a pure function of (seed, stream, epoch, index)."""
 
     seed: int
     stream: int
     epoch: int
     index: int
+
+
+class Purpose(IntEnum):
+    """What random numbers are drawn for; each purpose has its own stream."""
+
+    GEOMETRY = 0  # transform, crop plane of the source, sampling
+    OUTLIERS = 1
+    JITTER = 2
+    TARGET_CROP = 3
+    TARGET_OUTLIERS = 4
+    STRETCH = 5
 
 
 _NOTHING = np.empty(0, np.float32)
@@ -112,63 +138,64 @@ class _Draw(NamedTuple):
     normal: np.ndarray  # (2, 3) Gaussian: directions of the rotation axis and of the crop plane
     uniform: np.ndarray  # (5,) in [0, 1): angle, its sign, translation
     noise: np.ndarray  # (n + N, 3) Gaussian
-    outlier: np.ndarray  # (round(outliers * n),) which source points
-    outlier_at: np.ndarray  # (..., 6) what they become
+    outlier: np.ndarray  # (round(outliers * n),) indices of source points
+    outlier_rows: np.ndarray  # (..., 6) the points that replace them
     target_plane: np.ndarray  # (3,) Gaussian: direction of the target's crop plane
-    target_outlier: np.ndarray  # as outlier and outlier_at, where both clouds are spoilt
-    target_outlier_at: np.ndarray
+    target_outlier: np.ndarray  # as outlier and outlier_rows, if both clouds are corrupted
+    target_outlier_rows: np.ndarray
     stretch: np.ndarray  # (4,) in [0, 1): factors of the axes, mirror
 
 
 def make_pairs(
-    clouds: CloudSet, shapes: Sequence[int], keys: Sequence[Key], how: PairSettings
+    clouds: CloudSet, shapes: Sequence[int], keys: Sequence[Key], settings: PairSettings
 ) -> PairBatch:
     """Draw one pair of each shape.
 
     Args:
         clouds: the clean clouds.
         shapes: B positions in `clouds`.
-        keys: B keys of the pairs' chance.
-        how: what a pair is.
+        keys: B keys.
+        settings: how pairs are drawn.
 
     Returns:
         B pairs; source and target carry normals behind the coordinates.
     """
-    size = clouds.rows.shape[1]
-    draws = [_draw(how, size, key) for key in keys]
+    draws = [_draw(settings, clouds.num_points, key) for key in keys]
     source_index, target_index = _stack(draws, "source"), _stack(draws, "target")
-    clean = clouds.rows[list(shapes)]
-    if how.stretch > 1:
-        clean = _stretched(clean, _stack(draws, "stretch"), how.stretch)
+    clean = clouds.rows[np.asarray(shapes)]
+    if settings.stretch > 1:
+        clean = _stretch(clean, _stack(draws, "stretch"), settings.stretch)
     source = np.take_along_axis(clean, source_index[..., None], 1)
     target = np.take_along_axis(clean, target_index[..., None], 1)
+    both = settings.corrupted == "both"
 
-    if how.num_source < how.num_points:
-        kept = _crop(source[..., :3], _stack(draws, "normal")[:, 1], how.num_source)
+    if settings.num_source < settings.num_points:
+        kept = _crop(source[..., :3], _stack(draws, "normal")[:, 1], settings.num_source)
         source = np.take_along_axis(source, kept[..., None], 1)
         source_index = np.take_along_axis(source_index, kept, 1)
-        if how.spoilt == "both":
-            kept = _crop(target[..., :3], _stack(draws, "target_plane"), how.num_source)
+        if both:
+            kept = _crop(target[..., :3], _stack(draws, "target_plane"), settings.num_source)
             target = np.take_along_axis(target, kept[..., None], 1)
-    if how.outliers:
+    if settings.outliers:
         batch = np.arange(len(draws))[:, None]
-        source[batch, _stack(draws, "outlier")] = _stack(draws, "outlier_at")
-        if how.spoilt == "both":
-            target[batch, _stack(draws, "target_outlier")] = _stack(draws, "target_outlier_at")
-    if how.sampling == "identical" and not how.unmatched:
-        match = _same_points(source_index, target_index, size)
+        source[batch, _stack(draws, "outlier")] = _stack(draws, "outlier_rows")
+        if both:
+            target[batch, _stack(draws, "target_outlier")] = _stack(draws, "target_outlier_rows")
+    if settings.sampling == "identical" and not settings.has_outliers:
+        match = _same_points(source_index, target_index, clouds.num_points)
     else:
-        match = _nearest(source[..., :3], target[..., :3], how)
-    if how.jitter:
-        noise = how.jitter * _stack(draws, "noise")
-        source[..., :3] += noise[:, : how.num_source]
-        target[..., :3] += noise[:, how.num_source :][:, : target.shape[1]]
-    if how.normals == "estimated":
+        match = _nearest(source[..., :3], target[..., :3], settings.max_match_distance)
+    if settings.jitter:
+        noise = settings.jitter * _stack(draws, "noise")
+        source[..., :3] += noise[:, : settings.num_source]
+        target[..., :3] += noise[:, settings.num_source :][:, : target.shape[1]]
+    if settings.normals == "estimated":
         for cloud in (*source, *target):
-            cloud[:, 3:] = estimate(cloud[:, :3])
+            cloud[:, 3:] = estimate_normals(cloud[:, :3])
 
-    rotation, translation = _motion(_stack(draws, "normal")[:, 0], _stack(draws, "uniform"), how)
-    # Points and normals turn alike: (B, 2N, 3) for the product, translation for points only.
+    axis, uniform = _stack(draws, "normal")[:, 0], _stack(draws, "uniform")
+    rotation, translation = _transform(axis, uniform, settings)
+    # Points and normals rotate alike: one product over (B, 2N, 3); only points are translated.
     moved = torch.from_numpy(target).view(len(draws), -1, 3) @ rotation.mT
     moved = moved.view(target.shape)
     moved[..., :3] += translation.unsqueeze(1)
@@ -183,62 +210,70 @@ def make_pairs(
     )
 
 
-def generator(key: Key) -> np.random.Generator:
-    """The generator of a key: counter-based, the same on every machine."""
+def generator(key: Key, purpose: int = Purpose.GEOMETRY) -> np.random.Generator:
+    """Return the random generator of a key and purpose: counter-based, equal on every machine."""
     seed = np.array((key.seed, key.stream << 32 | key.epoch), np.uint64)
-    counter = np.array((0, 0, 0, key.index), np.uint64)
+    counter = np.array((0, 0, purpose, key.index), np.uint64)
     return np.random.Generator(np.random.Philox(key=seed, counter=counter))
 
 
-def _draw(how: PairSettings, size: int, key: Key) -> _Draw:
-    """Draw in a fixed order, so that settings that are off do not shift those that are on."""
+def _draw(settings: PairSettings, size: int, key: Key) -> _Draw:
+    """Draw what the settings ask for, each purpose from its own stream."""
     rng = generator(key)
-    n, kept = how.num_points, how.num_source
+    n, both = settings.num_points, settings.corrupted == "both"
     normal, uniform = rng.standard_normal((2, 3)), rng.random(5)
     source = rng.choice(size, n, replace=False)
-    if how.sampling == "identical":
+    if settings.sampling == "identical":
         target = rng.permutation(source)
-    elif how.sampling == "independent":
+    elif settings.sampling == "independent":
         target = rng.choice(size, n, replace=False)
     else:
-        left = np.setdiff1d(np.arange(size), source, assume_unique=True)
-        target = rng.choice(left, n, replace=False)
-    outlier = outlier_at = noise = _NOTHING
-    if how.outliers:
-        outlier, outlier_at = _outliers(rng, how)
-    if how.jitter:
-        noise = rng.standard_normal((kept + n, 3), np.float32)
-    target_plane = target_outlier = target_outlier_at = _NOTHING
-    if how.spoilt == "both":
-        target_plane = rng.standard_normal(3)
-        target_outlier, target_outlier_at = _outliers(rng, how)
-    stretch = rng.random(4) if how.stretch > 1 else _NOTHING
+        rest = np.setdiff1d(np.arange(size), source, assume_unique=True)
+        target = rng.choice(rest, n, replace=False)
+    nothing = _NOTHING, _NOTHING
+    outliers = _draw_outliers(key, Purpose.OUTLIERS, settings) if settings.outliers else nothing
+    target_outliers = nothing
+    if settings.outliers and both:
+        target_outliers = _draw_outliers(key, Purpose.TARGET_OUTLIERS, settings)
+    noise = target_plane = stretch = _NOTHING
+    if settings.jitter:
+        shape = settings.num_source + n, 3
+        noise = generator(key, Purpose.JITTER).standard_normal(shape, np.float32)
+    if both:
+        target_plane = generator(key, Purpose.TARGET_CROP).standard_normal(3)
+    if settings.stretch > 1:
+        stretch = generator(key, Purpose.STRETCH).random(4)
     return _Draw(
-        source, target, normal, uniform, noise, outlier, outlier_at,
-        target_plane, target_outlier, target_outlier_at, stretch,
-    )  # fmt: skip
+        source, target, normal, uniform, noise, *outliers, target_plane, *target_outliers, stretch
+    )
 
 
-def _outliers(rng: np.random.Generator, how: PairSettings) -> tuple[np.ndarray, np.ndarray]:
-    """Which points are replaced, and the points and normals they become."""
-    chosen = rng.choice(how.num_source, round(how.outliers * how.num_source), replace=False)
-    at = rng.random((len(chosen), 6), np.float32) - np.float32(0.5)
-    at[:, 3:] /= np.linalg.norm(at[:, 3:], axis=1, keepdims=True)
-    return chosen, at
+def _draw_outliers(
+    key: Key, purpose: Purpose, settings: PairSettings
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw which points are replaced, and the points and normals that replace them."""
+    rng, n = generator(key, purpose), settings.num_source
+    replaced = rng.choice(n, round(settings.outliers * n), replace=False)
+    rows = rng.random((len(replaced), 6), np.float32) - np.float32(0.5)
+    rows[:, 3:] /= np.linalg.norm(rows[:, 3:], axis=1, keepdims=True)
+    return replaced, rows
 
 
-def _motion(axis: np.ndarray, uniform: np.ndarray, how: PairSettings) -> tuple[Tensor, Tensor]:
-    """The true motions: rotation (B, 3, 3) and translation (B, 3), float32."""
-    angle = how.min_rotation_deg + (how.rotation_deg - how.min_rotation_deg) * uniform[:, 0]
+def _transform(
+    axis: np.ndarray, uniform: np.ndarray, settings: PairSettings
+) -> tuple[Tensor, Tensor]:
+    """Compute the true transforms: rotation (B, 3, 3) and translation (B, 3), float32."""
+    low, high = settings.min_rotation_deg, settings.rotation_deg
+    angle = low + (high - low) * uniform[:, 0]
     angle = np.deg2rad(np.where(uniform[:, 1] < 0.5, angle, -angle))
     axis = axis / np.linalg.norm(axis, axis=1, keepdims=True)
     rotation = rigid.axis_angle_to_matrix(torch.from_numpy(axis), torch.from_numpy(angle))
-    translation = how.translation * (2 * uniform[:, 2:] - 1)
+    translation = settings.translation * (2 * uniform[:, 2:] - 1)
     return rotation.float(), torch.from_numpy(translation).float()
 
 
-def _stretched(rows: np.ndarray, uniform: np.ndarray, most: float) -> np.ndarray:
-    """Clouds (B, P, 6) drawn out along their axes, back in the unit sphere; normals are lost."""
+def _stretch(rows: np.ndarray, uniform: np.ndarray, most: float) -> np.ndarray:
+    """Scale clouds (B, P, 6) along their axes, back into the unit sphere; normals become zero."""
     factor = most ** (2 * uniform[:, :3] - 1)
     factor[:, 0] *= np.where(uniform[:, 3] < 0.5, 1, -1)
     points = rows[..., :3] * factor[:, None]
@@ -247,25 +282,26 @@ def _stretched(rows: np.ndarray, uniform: np.ndarray, most: float) -> np.ndarray
 
 
 def _crop(points: np.ndarray, plane: np.ndarray, keep: int) -> np.ndarray:
-    """Indices (B, keep), ascending, of the points least far on the plane's positive side."""
+    """Select the indices (B, keep), ascending, of the points lowest along the plane's normal."""
     centred = points - points.mean(1, keepdims=True)
     height = (centred @ plane[..., None].astype(points.dtype))[..., 0]
     return np.sort(np.argsort(height, 1, kind="stable")[:, :keep], 1)
 
 
 def _same_points(source: np.ndarray, target: np.ndarray, size: int) -> np.ndarray:
-    """Where each source point's own copy went, by construction."""
-    place = np.empty((len(target), size), np.int64)
-    np.put_along_axis(place, target, np.arange(target.shape[1])[None], 1)
-    return np.take_along_axis(place, source, 1)
+    """Find the target index of each source point's own copy, by construction."""
+    position = np.empty((len(target), size), np.int64)
+    np.put_along_axis(position, target, np.arange(target.shape[1])[None], 1)
+    return np.take_along_axis(position, source, 1)
 
 
-def _nearest(source: np.ndarray, target: np.ndarray, how: PairSettings) -> np.ndarray:
-    """The nearest target point of each source point; M where outliers may be and none is near."""
-    reach = how.outlier_distance if how.unmatched else np.inf
-    pairs = zip(source, target, strict=True)
-    found = [KDTree(y).query(x, distance_upper_bound=reach)[1] for x, y in pairs]
-    return np.stack(found).astype(np.int64)
+def _nearest(source: np.ndarray, target: np.ndarray, max_distance: float) -> np.ndarray:
+    """Find the nearest target point of each source point; M if none is within the distance."""
+    index = [
+        KDTree(y).query(x, distance_upper_bound=max_distance)[1]
+        for x, y in zip(source, target, strict=True)
+    ]
+    return np.stack(index).astype(np.int64)
 
 
 def _stack(draws: list[_Draw], name: str) -> np.ndarray:

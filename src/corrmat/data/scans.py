@@ -1,4 +1,4 @@
-"""Anybody's clouds and meshes: files in, points out, and back."""
+"""Read and write point clouds and meshes in the usual file formats."""
 
 from pathlib import Path
 
@@ -14,22 +14,23 @@ SAMPLES = 20_000  # points taken of a mesh's surface
 
 
 def read_scan(path: Path, seed: int = 0) -> np.ndarray:
-    """The points of a file, (N, 3) float64 in its own units; a mesh is sampled evenly.
+    """Read the points of a file, (N, 3) float64 in its units; a mesh is sampled uniformly.
 
-    Parts of a scene are merged, colours and all else are left out. What the points are is not
-    judged here.
+    Parts of a scene are merged; colours and everything else are ignored.
 
     Args:
         path: PLY, OBJ, STL, OFF, GLB or GLTF; PCD, XYZ, TXT, CSV, NPY or NPZ.
-        seed: of the samples on a mesh.
+        seed: of the sampling of a mesh.
 
     Raises:
         CorrmatError: the file is missing, empty, of another format, or cut short.
     """
     kind = path.suffix.lower()
     if kind not in MESHES + CLOUDS:
-        known = ", ".join(name[1:] for name in MESHES + CLOUDS)
-        raise CorrmatError(f"{path}: format {kind or 'without a suffix'} unknown; known: {known}")
+        formats = ", ".join(name[1:] for name in MESHES + CLOUDS)
+        raise CorrmatError(
+            f"{path}: format {kind or 'without a suffix'} unknown; formats: {formats}"
+        )
     if not path.is_file():
         raise CorrmatError(f"{path}: no such file")
     if not path.stat().st_size:
@@ -47,17 +48,15 @@ def read_scan(path: Path, seed: int = 0) -> np.ndarray:
         points = np.ascontiguousarray(points[:, :3], np.float64)
     except CorrmatError:
         raise
-    # Readers of damaged files fail in every way there is; each means the same to the user.
-    except Exception as error:
-        said = f"{type(error).__name__}: {error}".splitlines()[0]
-        raise CorrmatError(f"{path} cannot be read as {kind[1:].upper()} ({said})") from error
+    except Exception as error:  # readers of damaged files raise errors of every type
+        raise _unreadable(path, error) from error
     if not len(points):
         raise CorrmatError(f"{path} holds no points")
     return points
 
 
 def write_ply(path: Path, points: np.ndarray) -> None:
-    """Points (N, 3) as a binary PLY of doubles: coordinates far from the origin keep their detail.
+    """Write points (N, 3) as a binary PLY of doubles, which keep detail far from the origin.
 
     Raises:
         CorrmatError: there is no such folder.
@@ -74,13 +73,44 @@ def write_ply(path: Path, points: np.ndarray) -> None:
     replace_bytes(path, "\n".join(header).encode() + points.astype("<f8").tobytes())
 
 
-def _scene(path: Path, seed: int) -> np.ndarray:
+def read_mesh(path: Path) -> trimesh.Trimesh | None:
+    """Read a mesh file as one mesh; None if it holds points without faces.
+
+    Raises:
+        CorrmatError: the file cannot be read.
+    """
+    try:
+        return _merge_meshes(_load_parts(path))
+    except Exception as error:  # readers of damaged files raise errors of every type
+        raise _unreadable(path, error) from error
+
+
+def _load_parts(path: Path) -> list[object]:
+    """Load a file with trimesh and return the parts of its scene."""
     loaded = trimesh.load(path)
-    parts = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
+    return list(loaded.dump()) if isinstance(loaded, trimesh.Scene) else [loaded]
+
+
+def _merge_meshes(parts: list[object]) -> trimesh.Trimesh | None:
     meshes = [p for p in parts if isinstance(p, trimesh.Trimesh) and len(p.faces) and p.area > 0]
-    if meshes:
-        whole = trimesh.util.concatenate(meshes)
-        return trimesh.sample.sample_surface(whole, SAMPLES, seed=seed)[0]
+    if not meshes:
+        return None
+    merged = trimesh.util.concatenate(meshes)
+    assert isinstance(merged, trimesh.Trimesh)
+    return merged
+
+
+def _unreadable(path: Path, error: Exception) -> CorrmatError:
+    reason = f"{type(error).__name__}: {error}".splitlines()[0]
+    return CorrmatError(f"{path} cannot be read as {path.suffix[1:].upper()} ({reason})")
+
+
+def _scene(path: Path, seed: int) -> np.ndarray:
+    """Sample the meshes of a file, or return its points if it has no faces."""
+    parts = _load_parts(path)
+    mesh = _merge_meshes(parts)
+    if mesh is not None:
+        return trimesh.sample.sample_surface(mesh, SAMPLES, seed=seed)[0]
     clouds = (trimesh.PointCloud, trimesh.Trimesh)
     points = [np.asarray(p.vertices) for p in parts if isinstance(p, clouds)]
     return np.concatenate([p.reshape(-1, 3) for p in points]) if points else np.empty((0, 3))
@@ -94,24 +124,26 @@ def _pcd(path: Path, seed: int) -> np.ndarray:
 
 
 def _numpy(path: Path, seed: int) -> np.ndarray:
-    found = np.load(path, allow_pickle=False)
-    if isinstance(found, np.ndarray):
-        return found
-    with found:
-        names = [n for n in found.files if found[n].ndim == 2 and found[n].shape[1] >= 3]
+    """Read the array of an NPY file, or the only array of points of an NPZ file."""
+    content = np.load(path, allow_pickle=False)
+    if isinstance(content, np.ndarray):
+        return content
+    with content:
+        names = [n for n in content.files if content[n].ndim == 2 and content[n].shape[1] >= 3]
         if len(names) != 1:
             raise CorrmatError(
-                f"{path} holds {len(names)} arrays of points (N, 3), not one: {found.files}"
+                f"{path} holds {len(names)} arrays of points (N, 3), not one: {content.files}"
             )
-        return found[names[0]]
+        return content[names[0]]
 
 
 def _text(path: Path, seed: int) -> np.ndarray:
+    """Read the first three columns of a text file; comments and a header are skipped."""
     lines = path.read_text("utf-8-sig").replace(",", " ").splitlines()
     rows = [line.split() for line in lines if line.strip() and not line.lstrip().startswith("#")]
-    if rows and len(rows[0]) == 1 and rows[0][0].isdigit():  # an XYZ file's count of points
+    if rows and len(rows[0]) == 1 and rows[0][0].isdigit():  # the number of points, in XYZ files
         rows = rows[1:]
-    if len(rows) > 1 and not any(map(_is_number, rows[0])):  # the columns' names
+    if len(rows) > 1 and not any(map(_is_number, rows[0])):  # a header
         rows = rows[1:]
     short = next((i for i, row in enumerate(rows) if len(row) < 3), None)
     if short is not None:

@@ -6,7 +6,7 @@ from torch import Tensor, nn
 
 
 class Transformer(nn.Module):
-    """The pointer of DCP v2: what a cloud's features become once they have seen the other's.
+    """The pointer of DCP v2: updates a cloud's features with attention to the other cloud's.
 
     Args:
         width: feature dimension, a multiple of heads.
@@ -22,13 +22,13 @@ class Transformer(nn.Module):
         self.decoder_norm = StdNorm(width)
 
     def forward(self, features: Tensor, other: Tensor) -> Tensor:
-        """decoder(features, encoder(other)): (B, N, d), (B, M, d) -> (B, N, d)."""
+        """Compute decoder(features, encoder(other)): (B, N, d), (B, M, d) -> (B, N, d)."""
         memory = self.encoder_norm(self.encoder(other))
         return self.decoder_norm(self.decoder(features, memory))
 
 
 class EncoderBlock(nn.Module):
-    """Self-attention and feed-forward, each on normed input and added back."""
+    """Self-attention and feed-forward, each pre-norm with a residual connection."""
 
     def __init__(self, width: int, heads: int, feedforward: int) -> None:
         super().__init__()
@@ -37,14 +37,14 @@ class EncoderBlock(nn.Module):
         self.norms = nn.ModuleList(StdNorm(width) for _ in range(2))
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, N, d) -> (B, N, d)."""
+        """Map (B, N, d) to (B, N, d)."""
         normed = self.norms[0](x)
         x = x + self.self_attention(normed, normed)
         return x + self.feedforward(self.norms[1](x))
 
 
 class DecoderBlock(nn.Module):
-    """Self-attention, attention over the other cloud's memory, and feed-forward."""
+    """Self-attention, cross-attention to the other cloud, and feed-forward."""
 
     def __init__(self, width: int, heads: int, feedforward: int) -> None:
         super().__init__()
@@ -54,7 +54,7 @@ class DecoderBlock(nn.Module):
         self.norms = nn.ModuleList(StdNorm(width) for _ in range(3))
 
     def forward(self, x: Tensor, memory: Tensor) -> Tensor:
-        """(B, N, d), (B, M, d) -> (B, N, d)."""
+        """Map (B, N, d) and memory (B, M, d) to (B, N, d)."""
         normed = self.norms[0](x)
         x = x + self.self_attention(normed, normed)
         x = x + self.cross_attention(self.norms[1](x), memory)
@@ -72,13 +72,13 @@ class Attention(nn.Module):
         self.query, self.key, self.value, self.out = (nn.Linear(width, width) for _ in range(4))
 
     def forward(self, x: Tensor, memory: Tensor) -> Tensor:
-        """Each of x (B, N, d) attends over memory (B, M, d); returns (B, N, d)."""
+        """Let each of x (B, N, d) attend to memory (B, M, d); return (B, N, d)."""
         q, k, v = (
             layer(t).unflatten(-1, (self.heads, -1)).transpose(1, 2)
             for layer, t in ((self.query, x), (self.key, memory), (self.value, memory))
         )
-        mixed = F.scaled_dot_product_attention(q, k, v)
-        return self.out(mixed.transpose(1, 2).flatten(-2))
+        attended = F.scaled_dot_product_attention(q, k, v)
+        return self.out(attended.transpose(1, 2).flatten(-2))
 
 
 class FeedForward(nn.Sequential):
@@ -91,9 +91,9 @@ class FeedForward(nn.Sequential):
 class StdNorm(nn.Module):
     """The annotated transformer's LayerNorm: gain * (x - mean) / (std + 1e-6) + bias.
 
-    Its std is the unbiased one. torch's fused kernel divides by the biased one, so the gain
-    makes up for it; the 1e-6 that the original adds to a std near one is left out, and a
-    constant row gives the bias as it does there.
+    The original uses the unbiased std. torch's fused kernel divides by the biased one, so the
+    gain is corrected. The 1e-6 that the original adds to a std near one is left out; a constant
+    row gives the bias, as in the original.
     """
 
     def __init__(self, width: int) -> None:
@@ -102,7 +102,7 @@ class StdNorm(nn.Module):
         self.bias = nn.Parameter(torch.zeros(width))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Norm over the last dimension."""
+        """Normalise over the last dimension."""
         width = x.shape[-1]
         unbiased = ((width - 1) / width) ** 0.5
         return F.layer_norm(x, (width,), self.gain * unbiased, self.bias, eps=1e-12)

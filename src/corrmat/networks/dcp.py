@@ -5,8 +5,8 @@ from typing import Literal
 from torch import Tensor, nn
 
 from corrmat.networks.attention import Transformer
-from corrmat.networks.compare import COMPARE, Outlier
 from corrmat.networks.dgcnn import DGCNN
+from corrmat.networks.matching import MATCHING_HEADS, Outlier
 from corrmat.ops.rigid import procrustes
 from corrmat.types import Prediction
 
@@ -22,8 +22,8 @@ class DCPNetwork(nn.Module):
         feedforward: hidden width of its feed-forward blocks.
         edge_channels: widths of DGCNN's edge convolutions.
         k: neighbours of each point, itself included.
-        outlier: how source points without a match get a class of their own (supplement A);
-            "none" for the network of the experiments without outliers.
+        outlier: the matching head, i.e. how source points without a match get a class of their
+            own (supplement A); "none" in the experiments without outliers.
     """
 
     def __init__(
@@ -40,10 +40,10 @@ class DCPNetwork(nn.Module):
         self.min_points = k
         self.embed = DGCNN(width, edge_channels, k)
         self.pointer = Transformer(width, heads, feedforward) if pointer == "transformer" else None
-        self.compare = COMPARE[outlier](width)
+        self.matching_head = MATCHING_HEADS[outlier](width)
 
     def features(self, source: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-        """Features (B, N, d) and (B, M, d) that are compared with each other."""
+        """Compute the features (B, N, d) and (B, M, d) that the matching head compares."""
         f_x, f_y = self.embed(source[..., :3]), self.embed(target[..., :3])
         if self.pointer is None:
             return f_x + f_x, f_y + f_y
@@ -51,7 +51,7 @@ class DCPNetwork(nn.Module):
 
     def forward(self, source: Tensor, target: Tensor) -> Prediction:
         """Register source (B, N, 3 or more) to target (B, M, 3 or more); xyz are read."""
-        c = self.compare(*self.features(source, target))
-        y_hat = c.soft_target(target[..., :3])
-        rotation, translation = procrustes(source[..., :3], y_hat, c.weight())
-        return Prediction(rotation, translation, c)
+        correspondence = self.matching_head(*self.features(source, target))
+        y_hat = correspondence.soft_target(target[..., :3])
+        rotation, translation = procrustes(source[..., :3], y_hat, correspondence.weight())
+        return Prediction(rotation, translation, correspondence)

@@ -1,35 +1,35 @@
-"""The network behind `corrmat register`: DCP's idea on features that no motion changes.
+"""The network behind `corrmat register`: DCP's idea on rotation-invariant features.
 
-DCP embeds coordinates and must learn every rotation from examples. Here the only things read of
-a cloud are its pair features, how two of its points and their normals lie to each other (Drost
-et al., CVPR 2010), so that whatever is learnt holds at every pose. Normals of a real cloud have
-no sign, and neither have these features; they tell left from right all the same. They come in
-twice: within a point's neighbourhood, and from a point to anchors all over its cloud, where
-attention reads them as GeoTransformer's does between superpoints (Qin et al., CVPR 2022).
+DCP embeds coordinates and must learn every rotation from examples. This network reads a cloud
+through point pair features only (Drost et al., CVPR 2010), so what it learns holds at every pose.
+Estimated normals have no reliable sign, and these features do not depend on it. They enter twice:
+within a point's neighbourhood, and from every point to anchors spread over its cloud, where
+attention uses them as GeoTransformer does between superpoints (Qin et al., CVPR 2022).
 """
 
 import torch
 from torch import Tensor, nn
 
+from corrmat.errors import require_positive
 from corrmat.networks.attention import Attention, FeedForward
-from corrmat.networks.compare import Matchability
+from corrmat.networks.matching import Matchability
 from corrmat.networks.ppf import SIGNLESS, signless_pair_features
-from corrmat.ops.neighbors import take
+from corrmat.ops.neighbors import gather_points
 from corrmat.ops.rigid import procrustes
-from corrmat.types import Prediction, with_earlier
+from corrmat.types import Prediction, last_of
 
 
 class InvariantNetwork(nn.Module):
-    """Neighbourhoods, then attention within and between clouds, then matches and doubt.
+    """Neighbourhood features, attention within and between clouds, matches with matchability.
 
     Args:
         width: feature dimension d.
         heads: attention heads.
-        layers: times that a cloud looks at itself and at the other.
-        anchors: points of a cloud that each of its points looks at.
-        neighbors: points read of each neighbourhood.
-        shares: sizes of the neighbourhoods, as shares of the cloud: what is near does not
-            depend on how many points the surface was sampled with.
+        layers: attention layers.
+        anchors: points of a cloud that each of its points attends to.
+        neighbors: points sampled of each neighbourhood.
+        shares: sizes of the neighbourhoods, as shares of the cloud, so that they do not depend
+            on the sampling density.
     """
 
     def __init__(
@@ -42,12 +42,13 @@ class InvariantNetwork(nn.Module):
         shares: tuple[float, ...] = (0.05, 0.1, 0.2),
     ) -> None:
         super().__init__()
+        require_positive(anchors=anchors, neighbors=neighbors)
         self.min_points = 3
         self.anchors, self.neighbors, self.shares = anchors, neighbors, shares
         self.embed = NeighborhoodEmbedding(width, len(shares))
         self.layers = nn.ModuleList(Layer(width, heads) for _ in range(layers))
         self.norm = nn.LayerNorm(width)
-        self.compare = Matchability(width)
+        self.matching_head = Matchability(width)
 
     def forward(self, source: Tensor, target: Tensor) -> Prediction:
         """Register source (B, N, 6) to target (B, M, 6): xyz and unit normals of any sign."""
@@ -55,62 +56,69 @@ class InvariantNetwork(nn.Module):
             raise ValueError("normals are needed: clouds of 6 columns, xyz and unit normal")
         x, y = source[..., :3], target[..., :3]
         scale = 2 / (radius(x) + radius(y))
-        around_x, around_y = self.around(source, scale), self.around(target, scale)
-        anchor_x, anchor_y = spread(x.shape[1], self.anchors), spread(y.shape[1], self.anchors)
-        seen_x, seen_y = _pairs(source, anchor_x, scale), _pairs(target, anchor_y, scale)
-        f_x, f_y = self.embed(around_x), self.embed(around_y)
-        # What neighbourhoods alone say is trained, too: attention then has something to weigh.
+        local_x = self.local_pair_features(source, scale)
+        local_y = self.local_pair_features(target, scale)
+        anchors_x = evenly_spaced_indices(x.shape[1], self.anchors)
+        anchors_y = evenly_spaced_indices(y.shape[1], self.anchors)
+        pairs_x = pair_features(source, anchors_x, scale)
+        pairs_y = pair_features(target, anchors_y, scale)
+        f_x, f_y = self.embed(local_x), self.embed(local_y)
+        # Matches of the neighbourhoods alone are trained as well: attention then refines them.
         steps = [self.match(f_x, f_y, x, y)] if self.training else []
         for layer in self.layers:
-            f_x, f_y = layer(f_x, f_y, seen_x, anchor_x), layer(f_y, f_x, seen_y, anchor_y)
-        return with_earlier([*steps, self.match(f_x, f_y, x, y)])
+            f_x, f_y = layer(f_x, f_y, pairs_x, anchors_x), layer(f_y, f_x, pairs_y, anchors_y)
+        return last_of([*steps, self.match(f_x, f_y, x, y)])
 
     def match(self, f_x: Tensor, f_y: Tensor, x: Tensor, y: Tensor) -> Prediction:
-        """The matches that features (B, N, d) and (B, M, d) of points x and y say."""
-        c = self.compare(self.norm(f_x), self.norm(f_y))
-        return Prediction(*procrustes(x, c.soft_target(y), c.weight()), c)
+        """Match points x and y by their features (B, N, d) and (B, M, d), and fit a transform."""
+        correspondence = self.matching_head(self.norm(f_x), self.norm(f_y))
+        y_hat = correspondence.soft_target(y)
+        return Prediction(*procrustes(x, y_hat, correspondence.weight()), correspondence)
 
     @torch.no_grad()
-    def around(self, cloud: Tensor, scale: Tensor) -> Tensor:
-        """Pair features of every point's neighbourhoods, (B, N, sizes, neighbors, F)."""
+    def local_pair_features(self, cloud: Tensor, scale: Tensor) -> Tensor:
+        """Compute pair features of every point's neighbourhoods, (B, N, sizes, neighbors, F)."""
         points = cloud[..., :3]
         n = points.shape[1]
         sizes = [min(n, max(2, round(share * n))) for share in self.shares]
         nearest = torch.cdist(points, points).topk(max(sizes), largest=False).indices
-        ranks = torch.stack([spread(size, self.neighbors) for size in sizes])
-        return _pairs(cloud, nearest[..., ranks.to(nearest.device)], scale)
+        ranks = torch.stack([evenly_spaced_indices(size, self.neighbors) for size in sizes])
+        return pair_features(cloud, nearest[..., ranks.to(nearest.device)], scale)
 
 
 def radius(points: Tensor) -> Tensor:
-    """(B,) median distance of points (B, N, 3) from their centroid; few outliers do not move it."""
+    """Compute the median distance (B,) of points (B, N, 3) from their centroid."""
     centred = points - points.mean(1, keepdim=True)
     return centred.norm(dim=-1).median(1).values
 
 
-def spread(size: int, count: int) -> Tensor:
-    """`count` indices into `size`, even from first to last; some come twice if size < count."""
+def evenly_spaced_indices(size: int, count: int) -> Tensor:
+    """Spread `count` indices evenly over range(size); indices repeat if size < count."""
     return torch.linspace(0, size - 1, count).round().long()
 
 
 @torch.no_grad()
-def _pairs(cloud: Tensor, index: Tensor, scale: Tensor) -> Tensor:
-    """Features (B, N, ..., F) of points (B, N, 6) to those at index (B, N, ...), or (A,) for all.
+def pair_features(cloud: Tensor, index: Tensor, scale: Tensor) -> Tensor:
+    """Compute pair features (B, N, ..., F) from every point to the points at an index.
 
-    Lengths are multiplied by scale (B,).
+    Args:
+        cloud: (B, N, 6) xyz and unit normals.
+        index: (B, N, ...) for each point, or (A,) for all points.
+        scale: (B,) factor of all lengths.
     """
-    other = cloud[:, index].unsqueeze(1) if index.ndim == 1 else take(cloud, index)
-    own = cloud[(slice(None), slice(None), *[None] * (other.ndim - 3))]
-    wide = scale[(slice(None), *[None] * (other.ndim - 1))]
-    offset = (other[..., :3] - own[..., :3]) * wide
-    return signless_pair_features(offset, own[..., 3:6], other[..., 3:6])
+    other = cloud[:, index].unsqueeze(1) if index.ndim == 1 else gather_points(cloud, index)
+    centre = cloud[(slice(None), slice(None), *[None] * (other.ndim - 3))]
+    factor = scale[(slice(None), *[None] * (other.ndim - 1))]
+    offset = (other[..., :3] - centre[..., :3]) * factor
+    return signless_pair_features(offset, centre[..., 3:6], other[..., 3:6])
 
 
 class NeighborhoodEmbedding(nn.Module):
-    """A point's feature: what its neighbours are to it, the mean and the most at each size.
+    """A point's feature: mean and maximum over its neighbours' pair features, at each size.
 
     Args:
         width: feature dimension.
-        sizes: neighbourhoods of a point.
+        sizes: number of neighbourhoods of a point.
     """
 
     def __init__(self, width: int, sizes: int) -> None:
@@ -118,14 +126,14 @@ class NeighborhoodEmbedding(nn.Module):
         self.edge = nn.Sequential(nn.Linear(SIGNLESS, 48), nn.ReLU(inplace=True))
         self.point = FeedForward(2 * 48 * sizes, 2 * width, width)
 
-    def forward(self, around: Tensor) -> Tensor:
-        """Pair features (B, N, sizes, neighbors, F) -> (B, N, width)."""
-        edges = self.edge(around)
+    def forward(self, pair_features: Tensor) -> Tensor:
+        """Map pair features (B, N, sizes, neighbors, F) to features (B, N, width)."""
+        edges = self.edge(pair_features)
         return self.point(torch.cat([edges.max(3).values, edges.mean(3)], -1).flatten(2))
 
 
 class Layer(nn.Module):
-    """Attention within the cloud, which sees pair features, and to the other; feed-forward."""
+    """Self-attention with pair features, cross-attention to the other cloud, feed-forward."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -134,19 +142,26 @@ class Layer(nn.Module):
         self.feedforward = FeedForward(width, 2 * width, width)
         self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(4))
 
-    def forward(self, x: Tensor, other: Tensor, seen: Tensor, anchors: Tensor) -> Tensor:
-        """(B, N, d), (B, M, d) and pair features (B, N, A, F) to the anchors (A,) -> (B, N, d)."""
+    def forward(self, x: Tensor, other: Tensor, pairs: Tensor, anchors: Tensor) -> Tensor:
+        """Update features (B, N, d) of a cloud.
+
+        Args:
+            x: (B, N, d).
+            other: (B, M, d) features of the other cloud.
+            pairs: (B, N, A, F) pair features to the anchors.
+            anchors: (A,) indices of the anchors.
+        """
         normed = self.norms[0](x)
-        x = x + self.within(normed, normed[:, anchors], seen)
+        x = x + self.within(normed, normed[:, anchors], pairs)
         x = x + self.between(self.norms[1](x), self.norms[2](other))
         return x + self.feedforward(self.norms[3](x))
 
 
 class PairAttention(nn.Module):
-    """Attention whose keys and values are what two points are to each other, too.
+    """Attention whose keys and values include pair features.
 
-    With r_ij the pair features: logits (q_i . k_j + p_i . r_ij) / sqrt(size), and under them the
-    mean of v_j beside the mean of r_ij.
+    With r_ij the pair features of points i and j, the logits are (q_i . k_j + p_i . r_ij) /
+    sqrt(size); the output joins the means of v_j and of r_ij under their softmax.
     """
 
     def __init__(self, width: int, heads: int) -> None:
@@ -157,13 +172,13 @@ class PairAttention(nn.Module):
         self.out = nn.Linear(width + heads * SIGNLESS, width)
 
     def forward(self, x: Tensor, anchors: Tensor, pairs: Tensor) -> Tensor:
-        """(B, N, d), (B, A, d), pair features (B, N, A, F) -> (B, N, d)."""
+        """Let x (B, N, d) attend to anchors (B, A, d), given pair features (B, N, A, F)."""
         width = self.heads * self.size
         q, p = self.query(x).split([width, self.heads * SIGNLESS], -1)
         k, v = self.key_value(anchors).split(width, -1)
         q, k, v = (t.unflatten(-1, (self.heads, -1)).transpose(1, 2) for t in (q, k, v))
         geometry = p.unflatten(-1, (self.heads, -1)) @ pairs.mT  # (B, N, H, A)
-        share = ((q @ k.mT + geometry.transpose(1, 2)) * self.size**-0.5).softmax(-1)
-        met = (share @ v).transpose(1, 2).flatten(2)
-        related = (share.transpose(1, 2) @ pairs).flatten(2)
-        return self.out(torch.cat([met, related], -1))
+        attention = ((q @ k.mT + geometry.transpose(1, 2)) * self.size**-0.5).softmax(-1)
+        values = (attention @ v).transpose(1, 2).flatten(2)
+        relations = (attention.transpose(1, 2) @ pairs).flatten(2)
+        return self.out(torch.cat([values, relations], -1))

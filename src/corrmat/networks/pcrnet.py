@@ -4,29 +4,31 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from corrmat.networks.compare import Compare
+from corrmat.errors import require_positive
+from corrmat.networks.matching import MatchingHead
 from corrmat.networks.pointnet import PointNet
 from corrmat.ops import rigid
 from corrmat.ops.rigid import procrustes
-from corrmat.types import Prediction, with_earlier
+from corrmat.types import Prediction, last_of
 
 
 class PCRNetwork(nn.Module):
-    """Regresses a pose from the two clouds' global features, again and again (section 5.3).
+    """Regresses a pose from the two clouds' global features, iteratively (section 5.3).
 
-    Every iteration moves the source by the pose found and composes the poses, with their gradient.
-    The last layer starts near the identity pose: from an arbitrary one, eight of them wander
-    off and nothing is learnt.
+    Every iteration moves the source by the predicted pose and composes the poses, with their
+    gradient. The last layer is initialised near the identity pose: from an arbitrary pose, eight
+    iterations diverge and nothing is learnt.
 
     Args:
         width: dimension of a cloud's global feature.
-        iterations: how often the pose is corrected.
+        iterations: number of pose corrections.
     """
 
     min_points = 1
 
     def __init__(self, width: int = 1024, iterations: int = 8) -> None:
         super().__init__()
+        require_positive(width=width, iterations=iterations)
         self.iterations = iterations
         self.embed = PointNet(width)
         sizes = (2 * width, 1024, 1024, 512, 512, 256)
@@ -48,23 +50,23 @@ class PCRNetwork(nn.Module):
         x, y = x - centre_x.unsqueeze(1), y - centre_y.unsqueeze(1)
         f_y = self.embed(y).amax(1)
         moved, steps = x, []
-        motion = rigid.identity(x)
+        transform = rigid.identity(x)
         for _ in range(self.iterations):
             pose = self.pose(torch.cat([f_y, self.embed(moved).amax(1)], 1)).to(x.dtype)
-            turn = quaternion_to_matrix(pose[:, :4]), pose[:, 4:]
-            moved, motion = rigid.apply(*turn, moved), rigid.compose(turn, motion)
-            # From centred clouds back to where they lie.
-            rotation, shift = motion
+            update = quaternion_to_matrix(pose[:, :4]), pose[:, 4:]
+            moved, transform = rigid.apply(*update, moved), rigid.compose(update, transform)
+            # From centred clouds back to the original coordinates.
+            rotation, shift = transform
             translation = rigid.apply(rotation, shift + centre_y, -centre_x.unsqueeze(1)).squeeze(1)
             steps.append(Prediction(rotation, translation))
-        return with_earlier(steps)
+        return last_of(steps)
 
 
 class PCRNetCorrNetwork(nn.Module):
-    """PCRNet's point features, one at a time, compared as in DCP; no iteration (section 5.3).
+    """PCRNet's per-point features compared as in DCP, without iterations (section 5.3).
 
-    A feature sees its own point and nothing else, so what it can learn to compare under any
-    rotation is the point's distance from the origin.
+    A feature depends on its own point alone, so under any rotation it can only learn to compare
+    the points' distances from the origin.
 
     Args:
         width: feature dimension d.
@@ -75,17 +77,17 @@ class PCRNetCorrNetwork(nn.Module):
     def __init__(self, width: int = 512) -> None:
         super().__init__()
         self.embed = PointNet(width, nn.BatchNorm1d, bias=False)
-        self.compare = Compare(width)
+        self.matching_head = MatchingHead(width)
 
     def forward(self, source: Tensor, target: Tensor) -> Prediction:
         """Register source (B, N, 3 or more) to target (B, M, 3 or more); xyz are read."""
         x, y = source[..., :3], target[..., :3]
-        c = self.compare(self.embed(x), self.embed(y))
-        return Prediction(*procrustes(x, c.soft_target(y)), c)
+        correspondence = self.matching_head(self.embed(x), self.embed(y))
+        return Prediction(*procrustes(x, correspondence.soft_target(y)), correspondence)
 
 
 def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
-    """Rotation (..., 3, 3) of a quaternion (..., 4), w first, of any length but zero."""
+    """Convert quaternions (..., 4), w first, of any length but zero, to rotations (..., 3, 3)."""
     w, x, y, z = F.normalize(quaternion, dim=-1).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),

@@ -1,4 +1,4 @@
-"""Shared MLPs: the same layers for every point, and PointNet made of them."""
+"""Shared MLPs (the same layers for every point) and PointNet."""
 
 from collections.abc import Callable, Sequence
 
@@ -8,11 +8,11 @@ Norm = Callable[[int], nn.Module]
 
 
 def shared_mlp(channels: Sequence[int], norm: Norm) -> nn.Sequential:
-    """Linear, norm, ReLU a layer, on tensors (B, channels, anything).
+    """Build a shared MLP (1 x 1 convolution, norm, ReLU a layer) on tensors (B, channels, L).
 
     Args:
         channels: width of the input and of every layer.
-        norm: makes a layer's norm from its width.
+        norm: builds a layer's norm from its width.
     """
     layers: list[nn.Module] = []
     for inputs, outputs in zip(channels, channels[1:], strict=False):
@@ -23,11 +23,11 @@ def shared_mlp(channels: Sequence[int], norm: Norm) -> nn.Sequential:
 class PointNet(nn.Module):
     """PointNet's five layers, 64-64-64-128-width: per-point features (Qi et al., CVPR 2017).
 
-    On rows of points, which on CPUs is a third faster than 1 x 1 convolutions.
+    It runs linear layers on rows of points: on CPUs a third faster than 1 x 1 convolutions.
 
     Args:
         width: feature dimension.
-        norm: makes a layer's norm from its width; None for no norms.
+        norm: builds a layer's norm from its width; None for no norms.
         bias: whether the linear layers have one.
     """
 
@@ -42,5 +42,5 @@ class PointNet(nn.Module):
         self.layers = nn.Sequential(*layers)
 
     def forward(self, points: Tensor) -> Tensor:
-        """Points (B, N, 3) -> features (B, N, width)."""
+        """Map points (B, N, 3) to features (B, N, width)."""
         return self.layers(points.flatten(0, 1)).unflatten(0, points.shape[:2])

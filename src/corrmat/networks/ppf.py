@@ -1,4 +1,4 @@
-"""Point-pair features: a neighbourhood as it looks from any side (RPM-Net, section 5.1)."""
+"""Point pair features (Drost et al., CVPR 2010), as RPM-Net uses them (its section 5.1)."""
 
 import math
 from typing import NamedTuple
@@ -7,31 +7,31 @@ import torch
 from torch import Tensor
 
 from corrmat.ops import rigid
-from corrmat.ops.neighbors import take, within_radius
+from corrmat.ops.neighbors import gather_points, within_radius
 
 
 class Neighborhoods(NamedTuple):
-    """Every point of a cloud with K neighbours; moves with the cloud."""
+    """K neighbours of every point of a cloud."""
 
     centre: Tensor  # (B, N, 3)
     offset: Tensor  # (B, N, K, 3) neighbour minus centre
-    ppf: Tensor  # (B, N, K, 4) does not change when the cloud moves
+    ppf: Tensor  # (B, N, K, 4) point pair features; a rigid transform does not change them
 
     def moved(self, rotation: Tensor, translation: Tensor) -> "Neighborhoods":
-        """The neighbourhoods after `R @ x + t`, rotation (B, 3, 3) and translation (B, 3)."""
-        still = torch.zeros_like(translation)
-        offset = rigid.apply(rotation, still, self.offset.flatten(1, 2)).view_as(self.offset)
+        """Transform the neighbourhoods by rotation (B, 3, 3) and translation (B, 3)."""
+        zero = torch.zeros_like(translation)
+        offset = rigid.apply(rotation, zero, self.offset.flatten(1, 2)).view_as(self.offset)
         return Neighborhoods(rigid.apply(rotation, translation, self.centre), offset, self.ppf)
 
     def features(self) -> Tensor:
-        """(B, N, K, 10): centre, offset, ppf."""
+        """Concatenate centre, offset and ppf: (B, N, K, 10)."""
         centre = self.centre.unsqueeze(2).expand_as(self.offset)
         return torch.cat([centre, self.offset, self.ppf], -1)
 
 
 @torch.no_grad()
 def neighborhoods(cloud: Tensor, radius: float, k: int) -> Neighborhoods:
-    """Up to k neighbours within a radius, and the pair features of each.
+    """Find up to k neighbours within a radius and compute the pair features of each.
 
     Args:
         cloud: (B, N, 6) xyz and unit normals.
@@ -40,13 +40,13 @@ def neighborhoods(cloud: Tensor, radius: float, k: int) -> Neighborhoods:
     """
     points, normals = cloud[..., :3], cloud[..., 3:]
     index = within_radius(points, radius, k)
-    offset = take(points, index) - points.unsqueeze(2)
-    ppf = point_pair_features(offset, normals.unsqueeze(2), take(normals, index))
+    offset = gather_points(points, index) - points.unsqueeze(2)
+    ppf = point_pair_features(offset, normals.unsqueeze(2), gather_points(normals, index))
     return Neighborhoods(points, offset, ppf)
 
 
 def point_pair_features(offset: Tensor, normal: Tensor, neighbor_normal: Tensor) -> Tensor:
-    """(angle(n_r, d), angle(n_i, d), angle(n_r, n_i), |d|), angles in radians.
+    """Compute (angle(n_r, d), angle(n_i, d), angle(n_r, n_i), |d|), angles in radians.
 
     Args:
         offset: d, (..., 3), neighbour minus centre.
@@ -57,9 +57,9 @@ def point_pair_features(offset: Tensor, normal: Tensor, neighbor_normal: Tensor)
         (..., 4).
     """
     normal = normal.expand_as(neighbor_normal)
-    angles = _angle_rad(normal, offset), _angle_rad(neighbor_normal, offset)
-    turn, distance = _angle_rad(normal, neighbor_normal), offset.norm(dim=-1)
-    return torch.stack([*angles, turn, distance], -1)
+    to_offset = _angle_rad(normal, offset), _angle_rad(neighbor_normal, offset)
+    between, distance = _angle_rad(normal, neighbor_normal), offset.norm(dim=-1)
+    return torch.stack([*to_offset, between, distance], -1)
 
 
 def _angle_rad(a: Tensor, b: Tensor) -> Tensor:
@@ -67,17 +67,17 @@ def _angle_rad(a: Tensor, b: Tensor) -> Tensor:
     return torch.atan2(cross.norm(dim=-1), dot)
 
 
-SIGNLESS = 13  # numbers that `signless_pair_features` gives
-_LENGTHS = (0.05, 0.1, 0.17, 0.27, 0.42, 0.65, 1.0, 1.6)
+SIGNLESS = 13  # features of `signless_pair_features`
+_BUMP_CENTRES = (0.05, 0.1, 0.17, 0.27, 0.42, 0.65, 1.0, 1.6)
 
 
 def signless_pair_features(offset: Tensor, normal: Tensor, neighbor_normal: Tensor) -> Tensor:
-    """Pair features that stay as they are when either normal is turned over.
+    """Compute pair features that do not change when either normal is flipped.
 
-    Eight bumps over the distance, one at each of a growing row of lengths; |n_r . d|, |n_i . d|
-    and |n_r . n_i| for the unit offset d; and two products in which every normal comes twice:
-    (n_r . d)(n_i . d)(n_r . n_i), which tells a bend from a step, and (n_r x n_i . d)(n_r . n_i),
-    which changes its sign in a mirror and so tells left from right.
+    They are eight radial bumps over log distance, then |n_r . d|, |n_i . d| and |n_r . n_i| for
+    the unit offset d, then two products in which every normal occurs twice:
+    (n_r . d)(n_i . d)(n_r . n_i) separates a bend from a step, and (n_r x n_i . d)(n_r . n_i)
+    changes sign under reflection, so it tells a shape from its mirror image.
 
     Args:
         offset: (..., 3), neighbour minus centre.
@@ -92,7 +92,9 @@ def signless_pair_features(offset: Tensor, normal: Tensor, neighbor_normal: Tens
     distance = x.square().sum(0).sqrt().clamp_min(1e-6)
     d = x / distance
     a, b, c = (n * d).sum(0), (m * d).sum(0), (n * m).sum(0)
-    turn = (torch.linalg.cross(*torch.broadcast_tensors(n, m), dim=0) * d).sum(0)
-    log = distance.log()
-    bumps = [torch.exp(-((log - math.log(at)) / 0.45).square()) for at in _LENGTHS]
-    return torch.stack([*bumps, a.abs(), b.abs(), c.abs(), a * b * c, turn * c], -1)
+    triple = (torch.linalg.cross(*torch.broadcast_tensors(n, m), dim=0) * d).sum(0)
+    log_distance = distance.log()
+    bumps = [
+        torch.exp(-((log_distance - math.log(centre)) / 0.45).square()) for centre in _BUMP_CENTRES
+    ]
+    return torch.stack([*bumps, a.abs(), b.abs(), c.abs(), a * b * c, triple * c], -1)

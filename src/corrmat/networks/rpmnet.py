@@ -6,32 +6,33 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from corrmat.networks.edges import top_of_mlp
+from corrmat.errors import require_positive
 from corrmat.networks.pointnet import shared_mlp
 from corrmat.networks.ppf import Neighborhoods, neighborhoods
 from corrmat.ops import rigid
 from corrmat.ops.correspondence import SinkhornCorrespondence
+from corrmat.ops.edge_mlp import group_norm_edge_mlp
 from corrmat.ops.rigid import procrustes
 from corrmat.ops.sinkhorn import Slack
-from corrmat.types import Prediction, with_earlier
+from corrmat.types import Prediction, last_of
 
 
 class RPMNetwork(nn.Module):
-    """Features of neighbourhoods, annealed affinities, Sinkhorn, weighted Procrustes; again.
+    """Neighbourhood features, annealed affinities, Sinkhorn, weighted Procrustes, iterated.
 
-    Every iteration moves the source by the transform so far (without its gradient) and looks
-    again. The target never moves, so its features are computed once; neighbours and pair
-    features of either cloud never change.
+    Every iteration moves the source by the current transform, without its gradient. The target
+    never moves, so its features are computed once. Neighbours and pair features of both clouds
+    never change.
 
     Args:
         width: feature dimension d, a multiple of 8.
         k: neighbours of each point.
         radius: within which they lie, in units of the clouds.
-        iterations: how many in training.
-        test_iterations: how many in evaluation.
-        sinkhorn_iterations: normalisations of rows and columns in each.
+        iterations: number of iterations in training.
+        test_iterations: number of iterations in evaluation.
+        sinkhorn_iterations: normalisations of rows and columns in each iteration.
         slack: see `sinkhorn_potentials`.
-        annealing_width: of the annealing net's pooled feature.
+        annealing_width: width of the annealing network's pooled feature.
     """
 
     min_points = 3
@@ -50,6 +51,10 @@ class RPMNetwork(nn.Module):
         super().__init__()
         if width < 8 or width % 8:
             raise ValueError(f"width {width} is not a multiple of 8, the groups of its norms")
+        require_positive(
+            k=k, iterations=iterations, test_iterations=test_iterations,
+            sinkhorn_iterations=sinkhorn_iterations,
+        )  # fmt: skip
         self.k, self.radius = k, radius
         self.iterations, self.test_iterations = iterations, test_iterations
         self.sinkhorn_iterations = sinkhorn_iterations
@@ -62,22 +67,25 @@ class RPMNetwork(nn.Module):
         if min(source.shape[-1], target.shape[-1]) < 6:
             raise ValueError("RPMNet needs normals: clouds of 6 columns, xyz and unit normal")
         x, y = source[..., :3], target[..., :3]
-        around_x = neighborhoods(source, self.radius, self.k)
+        neighborhoods_x = neighborhoods(source, self.radius, self.k)
         f_y = self.embed(neighborhoods(target, self.radius, self.k))
         rotation, translation = rigid.identity(x)
         steps: list[Prediction] = []
         for _ in range(self.iterations if self.training else self.test_iterations):
-            so_far = rotation.detach(), translation.detach()
-            f_x = self.embed(around_x.moved(*so_far))
-            beta, alpha = self.annealing(rigid.apply(*so_far, x), y)
-            c = SinkhornCorrespondence(f_x, f_y, beta, alpha, self.sinkhorn_iterations, self.slack)
-            rotation, translation = procrustes(x, c.soft_target(y), c.weight())
-            steps.append(Prediction(rotation, translation, c))
-        return with_earlier(steps)
+            current = rotation.detach(), translation.detach()
+            f_x = self.embed(neighborhoods_x.moved(*current))
+            beta, alpha = self.annealing(rigid.apply(*current, x), y)
+            correspondence = SinkhornCorrespondence(
+                f_x, f_y, beta, alpha, self.sinkhorn_iterations, self.slack
+            )
+            y_hat = correspondence.soft_target(y)
+            rotation, translation = procrustes(x, y_hat, correspondence.weight())
+            steps.append(Prediction(rotation, translation, correspondence))
+        return last_of(steps)
 
 
 class NeighborhoodNet(nn.Module):
-    """Unit features of points from their neighbourhoods: a shared MLP, maximum, another MLP."""
+    """Point features of unit length: shared MLP on neighbours, max-pooling, another MLP."""
 
     def __init__(self, width: int = 96) -> None:
         super().__init__()
@@ -86,14 +94,14 @@ class NeighborhoodNet(nn.Module):
         self.point = shared_mlp((2 * width, 2 * width, width), norm)
         self.out = nn.Conv1d(width, width, 1)
 
-    def forward(self, around: Neighborhoods) -> Tensor:
-        """Features (B, N, d) of length one."""
-        top = top_of_mlp(around.features(), self.edge)
-        return F.normalize(self.out(self.point(top.mT)).mT, dim=-1)
+    def forward(self, neighborhoods: Neighborhoods) -> Tensor:
+        """Compute unit features (B, N, d)."""
+        pooled = group_norm_edge_mlp(neighborhoods.features(), self.edge)
+        return F.normalize(self.out(self.point(pooled.mT)).mT, dim=-1)
 
 
 class AnnealingNet(nn.Module):
-    """Reads off both clouds how sharp the matching can be: beta and alpha, positive."""
+    """Predicts the annealing parameters of the affinities from both clouds: beta and alpha."""
 
     def __init__(self, width: int = 1024) -> None:
         super().__init__()
@@ -108,7 +116,7 @@ class AnnealingNet(nn.Module):
         )  # fmt: skip
 
     def forward(self, source: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-        """Clouds (B, N, 3) and (B, M, 3) in one frame -> beta (B,), alpha (B,)."""
+        """Map clouds (B, N, 3) and (B, M, 3) in one frame to positive beta (B,) and alpha (B,)."""
         flagged = torch.cat([F.pad(source, (0, 1), value=0.0), F.pad(target, (0, 1), value=1.0)], 1)
         pooled = self.pooled(self.point(flagged.mT).amax(2))
         beta, alpha = F.softplus(pooled).unbind(1)

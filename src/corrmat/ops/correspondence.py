@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from corrmat.ops.neighbors import take
+from corrmat.ops.neighbors import gather_points
 from corrmat.ops.sinkhorn import Slack, sinkhorn_potentials
 from corrmat.ops.streaming import argmax_rows, softmax_rows
 
@@ -14,9 +14,12 @@ from corrmat.ops.streaming import argmax_rows, softmax_rows
 class SoftCorrespondence:
     """C = softmax(scale * F_X F_Y^T), one row per source point (paper section 4).
 
-    Vectors stand for the matrix, a logit is the dot product of two of them, and only `logits`
-    and `prob` promise an N x M tensor: all else takes memory linear in N and M. With an outlier
-    class (supplement A) it is N x (M + 1), that class last: index M.
+    Row i is a classifier of source point i: its classes are the M target points and, with
+    `outlier` logits, one more class at index M for points without a match (supplement A).
+
+    To stay small, the object holds the features and not the matrix. Every logit is the dot
+    product of two vectors, so `nll`, `soft_target`, `argmax` and `weight` stream over rows with
+    memory linear in N and M (`ops.streaming`). Only `logits` and `prob` return N x M tensors.
 
     Args:
         feature_source: F_X, (B, N, d).
@@ -45,19 +48,19 @@ class SoftCorrespondence:
 
     @functools.cached_property
     def _vectors(self) -> tuple[Tensor, Tensor, Tensor | None]:
-        """What logits are dot products of, (B, N, D) and (B, M, D), and the last column's."""
+        """Vectors (B, N, D) and (B, M, D) whose dot products are logits, and outlier logits."""
         return self.scale * self.feature_source, self.feature_target, self.outlier
 
     def _rows(self, y: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Log-sum-exp of the rows, and the means of y under their softmax; made once."""
-        known = self.__dict__.get("_made")
-        if known is None or (y is not None and known[0] is not y):
+        """Compute the log-sum-exp of the rows and the means of y under their softmax; cached."""
+        cached = self.__dict__.get("_cached_rows")
+        if cached is None or (y is not None and cached[0] is not y):
             a, b, last = self._vectors
             values = b[..., :0] if y is None else y.to(b.dtype)
             with torch.autocast(a.device.type, enabled=False):
-                known = y, *softmax_rows(a, b, values.detach(), last)
-            self._made = known
-        return known[1:]
+                cached = y, *softmax_rows(a, b, values.detach(), last)
+            self._cached_rows = cached
+        return cached[1:]
 
     @functools.cached_property
     def _logits(self) -> Tensor:
@@ -71,29 +74,29 @@ class SoftCorrespondence:
         return self._logits.softmax(-1)
 
     def logits(self) -> Tensor:
-        """(B, N, M or M + 1) scores before the softmax; dense."""
+        """Return the scores before the softmax, (B, N, M or M + 1), as a dense tensor."""
         return self._logits
 
     def prob(self) -> Tensor:
-        """(B, N, M or M + 1) probabilities; every row sums to one. Dense."""
+        """Return the probabilities (B, N, M or M + 1) as a dense tensor; rows sum to one."""
         return self._prob
 
     def argmax(self) -> Tensor:
-        """(B, N) int64: the most probable class of each source point, M for the outlier's."""
+        """Return the most probable class of each source point, (B, N) int64; M means outlier."""
         with torch.autocast(self.feature_source.device.type, enabled=False):
             return argmax_rows(*self._vectors)
 
     def weight(self) -> Tensor:
-        """(B, N) in [0, 1]: how much of a row lies on target points; 1 - p_outlier."""
+        """Return the probability of not being an outlier, (B, N) in [0, 1]: 1 - p_outlier."""
         total, _ = self._rows()
         if self.outlier is None:
             return torch.ones_like(total)
         return 1 - (self.outlier - total).exp()
 
     def soft_target(self, y: Tensor) -> Tensor:
-        """(B, N, 3): the expected match of each source point, for y (B, M, 3).
+        """Return the expected match of each source point, (B, N, 3), for y (B, M, 3).
 
-        Y_hat = C Y; with an outlier class, given that the point is none.
+        Y_hat = C Y; with an outlier class, conditional on the point being an inlier.
         """
         total, mean = self._rows(y)
         last = self._vectors[2]
@@ -102,42 +105,42 @@ class SoftCorrespondence:
         return mean / (1 - (last - total).exp()).unsqueeze(-1).clamp_min(1e-20)
 
     def nll(self, index: Tensor) -> Tensor:
-        """Cross-entropy of each row against its true match (paper section 4, L_CE).
+        """Return the cross-entropy of each row against its true match (paper section 4, L_CE).
 
         Args:
-            index: (B, N) int64, the true target index; anything that is no class of this
-                matrix (-1 for no match, M for an outlier if it has no such class) is left out.
+            index: (B, N) int64, the true target index. Rows whose index is not a class of this
+                matrix are ignored: -1 for no match, M if there is no outlier class.
 
         Returns:
-            (B, N) negative log-likelihoods; 0 for rows left out.
+            (B, N) negative log-likelihoods; 0 for ignored rows.
         """
         total, _ = self._rows()
-        return torch.where(self.is_class(index), total - self._picked(index), 0)
+        return torch.where(self.is_class(index), total - self._logit_at(index), 0)
 
-    def _picked(self, index: Tensor) -> Tensor:
-        """(B, N) logits at a class of each row; anything where the index is none."""
+    def _logit_at(self, index: Tensor) -> Tensor:
+        """Return one logit of each row (B, N); arbitrary where the index is not a class."""
         a, b, last = self._vectors
-        found = (a * take(b, index.clamp(0, self.num_target - 1))).sum(-1)
-        return found if last is None else torch.where(index == self.num_target, last, found)
+        logit = (a * gather_points(b, index.clamp(0, self.num_target - 1))).sum(-1)
+        return logit if last is None else torch.where(index == self.num_target, last, logit)
 
     def is_class(self, index: Tensor) -> Tensor:
-        """Which of these indices, of any shape, name a class of this matrix."""
+        """Tell which of these indices (any shape) are classes of this matrix."""
         return (index >= 0) & (index < self.num_target + (self.outlier is not None))
 
 
 class _LogCorrespondence(SoftCorrespondence):
-    """A matrix whose logits are its logarithm already; rows sum to at most one."""
+    """A matrix whose logits are already its logarithm; rows sum to at most one."""
 
     @functools.cached_property
     def _prob(self) -> Tensor:
         return self._logits.exp()
 
     def nll(self, index: Tensor) -> Tensor:
-        """-log C at the true match; see `SoftCorrespondence.nll`."""
-        return torch.where(self.is_class(index), -self._picked(index), 0)
+        """Return -log C at the true match; see `SoftCorrespondence.nll`."""
+        return torch.where(self.is_class(index), -self._logit_at(index), 0)
 
     def weight(self) -> Tensor:
-        """(B, N) in [0, 1]: how much of a row lies on target points."""
+        """Return the sum of each row over target points, (B, N) in [0, 1]."""
         total, last = self._rows()[0], self._vectors[2]
         return total.exp() - (0 if last is None else last.exp())
 
@@ -145,14 +148,14 @@ class _LogCorrespondence(SoftCorrespondence):
 class SinkhornCorrespondence(_LogCorrespondence):
     """RPMNet's matrix: affinities -beta (||f_x - f_y||^2 - alpha), normalised by Sinkhorn.
 
-    Rows sum to at most one, and what they lack is doubt: `weight`. `logits` is the logarithm
-    of the normalised matrix.
+    Rows sum to at most one; the rest is the probability of having no match (see `weight`).
+    `logits` is the logarithm of the normalised matrix.
 
     Args:
         feature_source: F_X, (B, N, d), unit vectors.
         feature_target: F_Y, (B, M, d), unit vectors.
         beta: (B,) inverse temperature.
-        alpha: (B,) squared distance from where on a match is worth less than slack.
+        alpha: (B,) squared distance beyond which a match scores below slack.
         iterations: of `sinkhorn_potentials`.
         slack: of `sinkhorn_potentials`.
     """
@@ -176,19 +179,19 @@ class SinkhornCorrespondence(_LogCorrespondence):
         f_x, f_y = self.feature_source, self.feature_target
         beta, alpha = self.beta[:, None, None], self.alpha[:, None, None]
         # beta (alpha - |f_x|^2 - |f_y|^2 + 2 f_x . f_y) as one dot product.
-        own = beta * (alpha - f_x.square().sum(-1, keepdim=True))
-        a = torch.cat([2 * beta * f_x, own, -beta.expand_as(own)], -1)
+        offset = beta * (alpha - f_x.square().sum(-1, keepdim=True))
+        a = torch.cat([2 * beta * f_x, offset, -beta.expand_as(offset)], -1)
         b = torch.cat([F.pad(f_y, (0, 1), value=1.0), f_y.square().sum(-1, keepdim=True)], -1)
         with torch.autocast(f_x.device.type, enabled=False):
             u, v = sinkhorn_potentials(a, b, self.iterations, self.slack)
-        return *_less(a, b, u, v), None
+        return *_subtract_potentials(a, b, u, v), None
 
 
 class MatchabilityCorrespondence(_LogCorrespondence):
     """LightGlue's matrix: softmax over rows and columns, times both points' matchability.
 
-    C_ij = m_i m_j softmax_j(S)_ij softmax_i(S)_ij; the outlier's class gets 1 - m_i. Rows sum
-    to at most one.
+    C_ij = m_i m_j softmax_j(S)_ij softmax_i(S)_ij, and the outlier class has probability 1 - m_i.
+    Rows sum to at most one.
 
     Args:
         feature_source: F_X, (B, N, d).
@@ -217,12 +220,12 @@ class MatchabilityCorrespondence(_LogCorrespondence):
             rows, _ = softmax_rows(a, b, b[..., :0])
             columns, _ = softmax_rows(b, a, a[..., :0])
         u, v = rows - F.logsigmoid(-out), columns - F.logsigmoid(self.matchable_target)
-        return *_less(2 * a, b, u, v), F.logsigmoid(out)
+        return *_subtract_potentials(2 * a, b, u, v), F.logsigmoid(out)
 
     def transposed(self) -> "MatchabilityCorrespondence":
-        """The same matrix with target points as rows, and their doubt as the last class."""
+        """Return the same matrix with target points as rows and their own outlier class last."""
         assert self.outlier is not None
-        other = MatchabilityCorrespondence(
+        transposed = MatchabilityCorrespondence(
             self.feature_target,
             self.feature_source,
             self.scale,
@@ -230,35 +233,35 @@ class MatchabilityCorrespondence(_LogCorrespondence):
             -self.outlier,
         )
         a, b, _ = self._vectors
-        other._vectors = b, a, F.logsigmoid(-self.matchable_target)
-        return other
+        transposed._vectors = b, a, F.logsigmoid(-self.matchable_target)
+        return transposed
 
 
-def _less(a: Tensor, b: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-    """Vectors of the dot products a_i . b_j - u_i - v_j."""
+def _subtract_potentials(a: Tensor, b: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+    """Extend a and b so that their dot products become a_i . b_j - u_i - v_j."""
     a = torch.cat([F.pad(a, (0, 1), value=-1.0), -u.unsqueeze(-1)], -1)
     return a, F.pad(torch.cat([b, v.unsqueeze(-1)], -1), (0, 1), value=1.0)
 
 
 def outlier_feature(feature_target: Tensor, b: float = -1.0) -> Tensor:
-    """f_O = argmin_f ||F_Y f - b 1||: a feature whose scores at all targets are b (supplement A).
+    """Solve f_O = argmin_f ||F_Y f - b 1||, a feature that scores b at every target (supplement A).
 
-    Where features outnumber target points, the smallest such f.
+    If there are more features than target points, the solution of smallest norm is returned.
 
     Args:
         feature_target: F_Y, (B, M, d).
-        b: the score; the paper chose -1.
+        b: the score; the paper chooses -1.
 
     Returns:
         (B, d), float32 or wider.
     """
     f = feature_target.double()
     gram = f.mT @ f
-    # Of no effect but to pick the smallest of many solutions, and zero for features of zero.
+    # The ridge selects the solution of smallest norm, and zero for features of zero.
     ridge = 1e-9 * gram.diagonal(dim1=1, dim2=2).mean(1)[:, None, None] + 1e-12
     eye = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
-    found = torch.linalg.solve(gram + ridge * eye, f.sum(1))
-    return (b * found).to(_at_least_float32(feature_target).dtype)
+    solution = torch.linalg.solve(gram + ridge * eye, f.sum(1))
+    return (b * solution).to(_at_least_float32(feature_target).dtype)
 
 
 def _at_least_float32(feature: Tensor) -> Tensor:

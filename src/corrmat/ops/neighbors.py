@@ -1,4 +1,4 @@
-"""Which points are near: k nearest, within a radius, the nearest of another cloud."""
+"""Neighbour queries: k nearest, within a radius, and the nearest point of another cloud."""
 
 import torch
 import torch.nn.functional as F
@@ -10,9 +10,9 @@ _CHUNK = 2**24  # entries of a distance matrix that exist at once
 
 @torch.no_grad()
 def knn(points: Tensor, k: int) -> Tensor:
-    """The k nearest points of the same cloud, the point itself included.
+    """Find the k nearest points of the same cloud, the point itself included.
 
-    No more than a slice of the distance matrix exists at a time.
+    Only a slice of the distance matrix exists at a time.
 
     Args:
         points: (B, N, 3).
@@ -34,7 +34,7 @@ def knn(points: Tensor, k: int) -> Tensor:
 
 @torch.no_grad()
 def within_radius(points: Tensor, radius: float, k: int) -> Tensor:
-    """The k points of LOWEST INDEX within a radius, the point itself left out (RPM-Net).
+    """Find the k points of LOWEST INDEX within a radius, the point itself left out (RPM-Net).
 
     Lowest index, not nearest: which neighbours a point gets depends on the order of its
     cloud, so that two shuffled copies of a cloud have different neighbourhoods.
@@ -45,33 +45,35 @@ def within_radius(points: Tensor, radius: float, k: int) -> Tensor:
         k: how many.
 
     Returns:
-        (B, N, k) int64, ascending; places left over hold the point's own index.
+        (B, N, k) int64, ascending; unused places hold the point's own index.
     """
     batch, n, _ = points.shape
-    own = torch.arange(n, device=points.device)
-    found = own.view(1, n, 1).repeat(batch, 1, k)
-    for part in own.split(max(1, _CHUNK // max(1, batch * n))):
+    all_points = torch.arange(n, device=points.device)
+    neighbors = all_points.view(1, n, 1).repeat(batch, 1, k)
+    for part in all_points.split(max(1, _CHUNK // max(1, batch * n))):
         near = torch.cdist(points[:, part], points, compute_mode=_EXACT) <= radius
         near[:, torch.arange(len(part)), part] = False
         rank = near.cumsum(-1, dtype=torch.int32)
         b, i, j = (near & (rank <= k)).nonzero(as_tuple=True)
-        found[b, part[i], rank[b, i, j].long() - 1] = j
-    return found
+        neighbors[b, part[i], rank[b, i, j].long() - 1] = j
+    return neighbors
 
 
 @torch.no_grad()
 def nearest(points: Tensor, cloud: Tensor) -> Tensor:
-    """Index (B, N) int64 of the nearest point of `cloud` (B, M, 3) to each of `points` (B, N, 3).
+    """Find the nearest point of `cloud` (B, M, 3) to each of `points` (B, N, 3): (B, N) int64.
 
-    Exact, and no more than a slice of the distance matrix exists at a time.
+    The result is exact, and only a slice of the distance matrix exists at a time.
     """
     rows = max(1, _CHUNK // max(1, cloud.shape[0] * cloud.shape[1]))
     parts = points.split(rows, 1)
     return torch.cat([torch.cdist(x, cloud, compute_mode=_EXACT).argmin(-1) for x in parts], 1)
 
 
-def take(values: Tensor, index: Tensor) -> Tensor:
-    """Rows of values (B, M, C) at index (B, ...): (B, ..., C)."""
-    first = torch.arange(0, values.shape[0] * values.shape[1], values.shape[1], device=index.device)
+def gather_points(values: Tensor, index: Tensor) -> Tensor:
+    """Gather rows of values (B, M, C) at index (B, ...): (B, ..., C)."""
+    first_row = torch.arange(
+        0, values.shape[0] * values.shape[1], values.shape[1], device=index.device
+    )
     # As an embedding: on CPUs several times faster than `gather`, forward and backward.
-    return F.embedding(index + first.view(-1, *[1] * (index.ndim - 1)), values.flatten(0, 1))
+    return F.embedding(index + first_row.view(-1, *[1] * (index.ndim - 1)), values.flatten(0, 1))

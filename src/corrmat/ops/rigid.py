@@ -1,4 +1,4 @@
-"""Rigid motions as batched tensors: apply, compose, invert, axis-angle, weighted Procrustes.
+"""Rigid transforms as batched tensors: apply, compose, invert, axis-angle, weighted Procrustes.
 
 Convention everywhere: `R @ x + t` takes the source onto the target.
 """
@@ -8,12 +8,12 @@ from torch import Tensor
 
 
 def apply(rotation: Tensor, translation: Tensor, points: Tensor) -> Tensor:
-    """Move points by a rigid motion.
+    """Move points by a rigid transform.
 
     Args:
         rotation: (..., 3, 3).
         translation: (..., 3).
-        points: (..., N, 3), leading dimensions as the motion's.
+        points: (..., N, 3), leading dimensions as the transform's.
 
     Returns:
         (..., N, 3), `R @ x + t` for every point x.
@@ -23,28 +23,28 @@ def apply(rotation: Tensor, translation: Tensor, points: Tensor) -> Tensor:
 
 
 def identity(points: Tensor) -> tuple[Tensor, Tensor]:
-    """The motions that leave points (B, N, 3) where they are: (B, 3, 3) and (B, 3)."""
+    """Return the identity transforms for points (B, N, 3): (B, 3, 3) and (B, 3)."""
     eye = torch.eye(3, dtype=points.dtype, device=points.device)
     return eye.expand(len(points), 3, 3), points.new_zeros(len(points), 3)
 
 
 def compose(outer: tuple[Tensor, Tensor], inner: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """The motion that applies `inner` first and `outer` second; each is ((..., 3, 3), (..., 3))."""
+    """Compose two transforms, each ((..., 3, 3), (..., 3)): `inner` is applied first."""
     rotation, translation = outer
     with torch.autocast(rotation.device.type, enabled=False):
-        turned = rotation @ inner[0]
-    return turned, apply(rotation, translation, inner[1].unsqueeze(-2)).squeeze(-2)
+        composed = rotation @ inner[0]
+    return composed, apply(rotation, translation, inner[1].unsqueeze(-2)).squeeze(-2)
 
 
 def invert(rotation: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
-    """The motion that undoes ((..., 3, 3), (..., 3))."""
+    """Invert a transform ((..., 3, 3), (..., 3))."""
     inverse = rotation.mT
     with torch.autocast(rotation.device.type, enabled=False):
         return inverse, -(inverse @ translation.unsqueeze(-1)).squeeze(-1)
 
 
 def axis_angle_to_matrix(axis: Tensor, angle_rad: Tensor) -> Tensor:
-    """Rotation matrices by Rodrigues' formula.
+    """Compute rotation matrices by Rodrigues' formula.
 
     Args:
         axis: (..., 3) unit vectors.
@@ -62,11 +62,11 @@ def axis_angle_to_matrix(axis: Tensor, angle_rad: Tensor) -> Tensor:
 def procrustes(
     source: Tensor, target: Tensor, weight: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Weighted orthogonal Procrustes (Horn, Kabsch): the motion that best maps source to target.
+    """Solve weighted orthogonal Procrustes (Horn, Kabsch): the rigid transform of least squares.
 
-    Minimises `sum_i w_i ||R x_i + t - y_i||^2` over proper rotations, in float64 inside.
-    Where the points do not determine the rotation (all equal, or on a line) one of the
-    minimisers is returned, and the gradient is finite.
+    It minimises `sum_i w_i ||R x_i + t - y_i||^2` over proper rotations, in float64 inside.
+    Where the points do not determine the rotation (all equal, or on a line) it returns one of
+    the minimisers, and the gradient is finite.
 
     Args:
         source: (B, N, 3) points x.
@@ -93,7 +93,7 @@ def procrustes(
 
 
 def rotation_from_covariance(covariance: Tensor) -> Tensor:
-    """The proper rotation R that maximises `trace(R @ H)` for H = sum_i w_i x_i y_i^T.
+    """Find the proper rotation R that maximises `trace(R @ H)` for H = sum_i w_i x_i y_i^T.
 
     Args:
         covariance: H, (B, 3, 3).
@@ -137,7 +137,7 @@ class _RotationFromCovariance(torch.autograd.Function):
 
 
 def _cross_matrix(vector: Tensor) -> Tensor:
-    """(..., 3) -> (..., 3, 3) with `[v] @ u = v x u`."""
+    """Map (..., 3) to the cross-product matrix (..., 3, 3), `[v] @ u = v x u`."""
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
     rows = [zero, -z, y, z, zero, -x, -y, x, zero]
@@ -145,6 +145,6 @@ def _cross_matrix(vector: Tensor) -> Tensor:
 
 
 def _axial(matrix: Tensor) -> Tensor:
-    """(..., 3, 3) -> (..., 3): the vector a with `<matrix, [w]> = <a, w>` for every w."""
+    """Map (..., 3, 3) to the vector a (..., 3) with `<matrix, [w]> = <a, w>` for every w."""
     m = matrix - matrix.mT
     return torch.stack([m[..., 2, 1], m[..., 0, 2], m[..., 1, 0]], -1)

@@ -1,0 +1,137 @@
+"""Anybody's shapes: a folder of meshes or clouds, sampled once into shards.
+
+Three layouts are understood. In ModelNet40's, a folder `train` or `test` decides the split
+(`chair/train/chair_0001.off`). In ShapeNet's (`03001627/<id>/models/model.obj`) and in a folder of
+files, with or without a folder a category, a hash of the path puts one shape in five into the test
+split.
+"""
+
+import hashlib
+import logging
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+
+from corrmat.data.build import build_shards
+from corrmat.data.clouds import CloudSet, cache_folder, open_shards, skipped_shapes
+from corrmat.data.normals import estimate_normals
+from corrmat.data.scans import MESHES, read_mesh, read_scan
+from corrmat.errors import CorrmatError
+
+log = logging.getLogger("corrmat")
+SUFFIXES = (*MESHES, ".pcd", ".xyz", ".npy", ".npz")
+POINTS = 2048
+TEST_SHARE = 0.2
+_SHOWN = 5  # skipped files named in the log
+
+
+class ShapeFile(NamedTuple):
+    """A file of the folder and what its path says."""
+
+    path: str
+    relative: str
+    label: int
+
+
+def load(split: str, count: int | None = None, root: Path | None = None) -> CloudSet:
+    """Load a split; every shape is sampled once, on all cores, into the cache folder.
+
+    An interrupted call continues with the next shard. Files that cannot be read are skipped,
+    counted and listed.
+
+    Args:
+        split: "train" or "test".
+        count: number of shapes; None for all.
+        root: the folder.
+
+    Raises:
+        CorrmatError: the folder is missing, or holds no shape of this split.
+    """
+    if root is None:
+        raise CorrmatError("data set folder needs its folder: ROOT=... or --data.root ...")
+    if not root.is_dir():
+        raise CorrmatError(f"no folder {root}")
+    names, files = find_shapes(root, split)
+    if not files:
+        raise CorrmatError(
+            f"{root} holds no shape for the {split} split; shapes are {', '.join(SUFFIXES)} files, "
+            "in any of the layouts of README.md (Data)"
+        )
+    identity = [
+        (f.relative, Path(f.path).stat().st_size, Path(f.path).stat().st_mtime_ns) for f in files
+    ]
+    digest = hashlib.sha256(repr((root.resolve().as_posix(), identity)).encode()).hexdigest()[:12]
+    shards = cache_folder() / f"folder-{root.name}-{digest}-{split}"
+    clouds = open_shards(shards)
+    if clouds is None:
+        build_shards(
+            shards, names, files, sample_shape, f"sampling {len(files)} {split} shapes (once)"
+        )
+        clouds = open_shards(shards)
+        skipped = list(skipped_shapes(shards))
+        if skipped:
+            shown = "\n  ".join([*skipped[:_SHOWN], *(["..."] if len(skipped) > _SHOWN else [])])
+            log.warning("%d of %d files were skipped:\n  %s", len(skipped), len(files), shown)
+    assert clouds is not None
+    return clouds.select(slice(count))
+
+
+def find_shapes(root: Path, split: str) -> tuple[tuple[str, ...], list[ShapeFile]]:
+    """Find the categories of a folder and the files of a split, in the order of their paths."""
+    paths = sorted(p for p in root.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
+    relative = [path.relative_to(root) for path in paths]
+    by_folder = any(_split_folder(path) for path in relative)
+    categories = [
+        path.parts[0] if len(path.parts) > 1 else root.resolve().name for path in relative
+    ]
+    if by_folder:  # `train/chair.off` has no category
+        categories = [root.resolve().name if c in ("train", "test") else c for c in categories]
+    names = tuple(sorted(set(categories)))
+    files = [
+        ShapeFile(str(path), rel.as_posix(), names.index(category))
+        for path, rel, category in zip(paths, relative, categories, strict=True)
+        if (_split_folder(rel) if by_folder else _split_by_hash(rel)) == split
+    ]
+    return names, files
+
+
+def sample_shape(file: ShapeFile) -> tuple[np.ndarray, int] | str:
+    """Sample a file: (2048, 6) float32 points with normals and the label, or why there is none.
+
+    Points are uniform on a mesh's surface, or a random subset of a cloud with estimated normals.
+    They are centred at their mean and scaled into the unit sphere. The sample depends on the
+    file's path in the folder alone.
+    """
+    rng = np.random.default_rng(list(hashlib.sha256(file.relative.encode()).digest()))
+    path = Path(file.path)
+    try:
+        mesh = read_mesh(path) if path.suffix.lower() in MESHES else None
+        if mesh is not None:
+            points, faces = trimesh.sample.sample_surface(mesh, POINTS, seed=rng)[:2]
+            normals = mesh.face_normals[faces]
+        else:
+            points, normals = read_scan(path), None
+            if len(points) < POINTS:
+                return f"{file.relative}: {len(points)} points, {POINTS} are needed"
+            points = points[rng.choice(len(points), POINTS, replace=False)]
+    except CorrmatError as error:
+        return str(error)
+    points = points - points.mean(0)
+    radius = np.linalg.norm(points, axis=1).max()
+    if not np.isfinite(radius) or radius == 0:
+        return f"{file.relative}: points are not finite, or all equal"
+    points = points / radius
+    rows = np.hstack([points, estimate_normals(points) if normals is None else normals])
+    return rows.astype(np.float32), file.label
+
+
+def _split_folder(relative: Path) -> str | None:
+    """Return "train" or "test" if a folder of this name holds the file."""
+    return next((part for part in relative.parts[:-1] if part in ("train", "test")), None)
+
+
+def _split_by_hash(relative: Path) -> str:
+    digest = hashlib.sha256(relative.as_posix().encode()).digest()
+    return "test" if int.from_bytes(digest[:4], "big") < TEST_SHARE * 2**32 else "train"

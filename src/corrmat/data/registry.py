@@ -1,0 +1,31 @@
+"""The data sets by name. A new one is a module with a `load` function and a line here."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from corrmat.data import folder, modelnet40
+from corrmat.data.clouds import CloudSet
+from corrmat.data.shapes import dataset
+from corrmat.errors import CorrmatError
+
+Loader = Callable[[str, int | None, Path | None], CloudSet]
+"""(split "train" or "test", number of shapes or None for all, root folder) -> CloudSet."""
+
+DATASETS: dict[str, Loader] = {
+    "shapes": dataset.load,
+    "modelnet40": modelnet40.load,
+    "folder": folder.load,
+}
+
+
+def load_clouds(
+    name: str, split: str, count: int | None = None, root: Path | None = None
+) -> CloudSet:
+    """Load a split of a data set.
+
+    Raises:
+        CorrmatError: there is no such data set, or it cannot be read.
+    """
+    if name not in DATASETS:
+        raise CorrmatError(f"unknown data set {name!r}; data sets: {', '.join(DATASETS)}")
+    return DATASETS[name](split, count, root)

@@ -1,0 +1,1 @@
+"""The embedded data set: forty parametric families, the solids they use, and their cache."""

@@ -1,0 +1,1 @@
+"""Registration of two clouds: `corrmat register` and what it is compared with."""

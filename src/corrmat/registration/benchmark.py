@@ -1,0 +1,166 @@
+"""Compare models on the same frozen pairs: what `corrmat compare` prints."""
+
+import json
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from rich.progress import track
+from scipy.spatial import KDTree
+
+from corrmat.data.pairs import STREAM, Key, PairSettings, Split, make_pairs
+from corrmat.data.registry import load_clouds
+from corrmat.errors import CorrmatError
+from corrmat.files import replace_text
+from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG, rotation_error_deg
+from corrmat.registration.register import Refine, register
+from corrmat.reporting.provenance import commit
+from corrmat.types import PairBatch
+
+Protocol = Literal["paper", "real", "clean"]
+PROTOCOLS: dict[Protocol, PairSettings] = {
+    # Experiment 1.2: the same points, the source without 30 %, the mesh's own normals.
+    "paper": PairSettings(keep=0.7),
+    # Two scans: no shared point, noise, both clouds cropped, outliers, normals estimated.
+    "real": PairSettings(
+        keep=0.7,
+        sampling="disjoint",
+        jitter=0.01,
+        outliers=0.05,
+        corrupted="both",
+        normals="estimated",
+    ),
+    # The same without crop and outliers.
+    "clean": PairSettings(sampling="disjoint", jitter=0.01, normals="estimated"),
+}
+COLUMNS = {
+    "mean_deg": "mean °",
+    "median_deg": "median °",
+    "recall_5deg": "recall at 5°",
+    "recall_adds": "recall ADD-S",
+    "ms": "ms a pair",
+}
+
+
+@dataclass(frozen=True)
+class ModelResult:
+    """A model's errors on all pairs; keys of the record's JSON."""
+
+    mean_deg: float
+    median_deg: float
+    recall_5deg: float
+    recall_adds: float
+    ms: float
+    per_pair: dict[str, list[float]]
+
+
+def frozen_pairs(
+    protocol: Protocol,
+    data: str = "shapes",
+    root: Path | None = None,
+    points: int = 512,
+    count: int = 120,
+    split: Split = "test",
+) -> PairBatch:
+    """Draw the pairs of a protocol: every model gets the same, on every machine.
+
+    Args:
+        protocol: one of `PROTOCOLS`.
+        data: name of the data set.
+        root: folder of the data set.
+        points: of a cloud before it is cropped.
+        count: of pairs, spread over the shapes of the split.
+        split: "test", or "val" (training shapes) to choose settings on.
+
+    Raises:
+        CorrmatError: the data set cannot be read, or has too few points.
+    """
+    clouds = load_clouds(data, "test" if split == "test" else "train", None, root)
+    settings = replace(PROTOCOLS[protocol], num_points=points)
+    if settings.min_cloud_points > clouds.num_points:
+        raise CorrmatError(
+            f"points = {points}: {protocol} pairs need shapes of {settings.min_cloud_points} "
+            f"points, not {clouds.num_points}"
+        )
+    chosen = np.linspace(0, len(clouds) - 1, min(count, len(clouds))).round().astype(int)
+    keys = [Key(0, STREAM[split], 0, int(index)) for index in chosen]
+    return make_pairs(clouds, chosen.tolist(), keys, settings)
+
+
+def compare(
+    pairs: PairBatch, models: Sequence[str], refine: Refine = "icp"
+) -> dict[str, ModelResult]:
+    """Register every pair with every model.
+
+    Args:
+        pairs: from `frozen_pairs`; the models get their normals.
+        models: as `register` takes them.
+        refine: the same for all.
+    """
+    for model in models:  # a model that cannot be loaded fails before the others have worked
+        _register_pair(pairs, 0, model, refine)
+    results = {}
+    for model in models:
+        rows = [
+            _register_pair(pairs, index, model, refine)
+            for index in track(range(len(pairs)), model, transient=True)
+        ]
+        angle, adds, ms, agreement, support = (np.array(c) for c in zip(*rows, strict=True))
+        results[model] = ModelResult(
+            mean_deg=float(angle.mean()),
+            median_deg=float(np.median(angle)),
+            recall_5deg=float((angle < RECALL_DEG).mean()),
+            recall_adds=float((adds < ADDS_THRESHOLD).mean()),
+            ms=statistics.median(ms.tolist()),
+            per_pair={
+                "shape": pairs.shape.tolist(),
+                "rotation_error_deg": np.round(angle, 4).tolist(),
+                "adds": np.round(adds, 5).tolist(),
+                "agreement": np.round(agreement, 4).tolist(),
+                "support": np.round(support, 4).tolist(),
+            },
+        )
+    return results
+
+
+def write_results(
+    path: Path, results: Mapping[str, ModelResult], about: Mapping[str, object]
+) -> None:
+    """Write the record of a comparison, with what it was made on."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    models = {name: asdict(result) for name, result in results.items()}
+    content = {**about, "commit": commit(), "models": models}
+    replace_text(path, json.dumps(content, indent=1) + "\n")
+
+
+def to_table(results: Mapping[str, ModelResult]) -> str:
+    """Format models and columns as plain text."""
+    width = max(map(len, results))
+    lines = [" " * width + "".join(f"{head:>14s}" for head in COLUMNS.values())]
+    for name, result in results.items():
+        cells = []
+        for column in COLUMNS:
+            value = getattr(result, column)
+            cells.append(f"{value:14.1%}" if column.startswith("recall") else f"{value:14.2f}")
+        lines.append(f"{name:{width}s}" + "".join(cells))
+    return "\n".join(lines)
+
+
+def _register_pair(
+    pairs: PairBatch, index: int, model: str, refine: Refine
+) -> tuple[float, float, float, float, float]:
+    """Register one pair: rotation error in degrees, ADD-S, milliseconds, agreement, support."""
+    source, target = (c[index].double().numpy() for c in (pairs.source, pairs.target))
+    result = register(source, target, model=model, refine=refine)
+    rotation, translation = pairs.rotation[index].double().numpy(), pairs.translation[index].numpy()
+    clean = pairs.clean[index].double().numpy()
+    truth = clean @ rotation.T + translation
+    moved = clean @ result.transform[:3, :3].T + result.transform[:3, 3]
+    adds = float(KDTree(truth).query(moved)[0].mean())
+    predicted = torch.from_numpy(result.transform[:3, :3])
+    angle = float(rotation_error_deg(predicted[None], pairs.rotation[index, None].double()))
+    return angle, adds, 1e3 * result.seconds, result.agreement, result.support

@@ -1,0 +1,191 @@
+"""Hypotheses of how two clouds lie to each other: from the network, and from classical pipelines.
+
+All generators have one signature, and `register` refines, scores and selects their hypotheses in
+the same way. Lengths are in units in which a cloud's radius is about one.
+"""
+
+import importlib
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import nn
+
+from corrmat.errors import CorrmatError
+from corrmat.ops.ransac import ransac as ransac_on_matches
+
+_SUPPORT_DISTANCE = 0.2  # residual beyond which a match does not support a transform
+_NO_MATCHES = np.empty((0, 2), np.int64), np.empty(0)
+
+
+class Hypotheses(NamedTuple):
+    """Rigid transforms that may take the source onto the target, and the matches behind them."""
+
+    transforms: np.ndarray  # (T, 4, 4) float64, T_target_source, best first
+    matches: np.ndarray  # (K, 2) int64 rows of source and target; K may be 0
+    confidence: np.ndarray  # (K,) in [0, 1]
+
+    def support(self, transform: np.ndarray, source: np.ndarray, target: np.ndarray) -> float:
+        """Compute the share of the matches, by weight, that support a transform; 1 without any.
+
+        Args:
+            transform: (4, 4).
+            source: (N, 3 or more), rows as in `matches`.
+            target: (M, 3 or more).
+        """
+        if not len(self.matches):
+            return 1.0
+        weight = np.sqrt(self.confidence)
+        return float(weight @ self.match_support(transform, source, target) / weight.sum())
+
+    def match_support(
+        self, transform: np.ndarray, source: np.ndarray, target: np.ndarray
+    ) -> np.ndarray:
+        """Compute how well a transform explains each match, (K,) in [0, 1]; see `support`."""
+        x, y = source[self.matches[:, 0], :3], target[self.matches[:, 1], :3]
+        residual = np.linalg.norm(x @ transform[:3, :3].T + transform[:3, 3] - y, axis=1)
+        return np.clip(1 - (residual / _SUPPORT_DISTANCE) ** 2, 0, None)
+
+
+HypothesisGenerator = Callable[[np.ndarray, np.ndarray, int], Hypotheses]
+"""(source (N, 6), target (M, 6), seed) -> Hypotheses; rows are xyz and unit normal."""
+
+
+class NetworkHypotheses:
+    """Hypotheses from a network's correspondence matrix: RANSAC on its strongest matches.
+
+    Args:
+        network: (source, target) -> Prediction with a correspondence.
+        inlier_threshold: largest residual of a match.
+        num_matches: strongest matches used.
+        count: hypotheses of RANSAC at most; the network's own transform comes on top.
+    """
+
+    def __init__(
+        self,
+        network: nn.Module,
+        inlier_threshold: float = 0.15,
+        num_matches: int = 256,
+        count: int = 16,
+    ) -> None:
+        self.network = network.eval()
+        self.inlier_threshold, self.num_matches = inlier_threshold, num_matches
+        self.count = count
+
+    @torch.no_grad()
+    def __call__(self, source: np.ndarray, target: np.ndarray, seed: int) -> Hypotheses:
+        """Generate hypotheses for source (N, 6) and target (M, 6)."""
+        x, y = (torch.from_numpy(np.asarray(c, np.float32)).unsqueeze(0) for c in (source, target))
+        least = int(getattr(self.network, "min_points", 3))
+        if min(x.shape[1], y.shape[1]) < least:
+            raise CorrmatError(f"this network needs clouds of at least {least} points")
+        prediction = self.network(x, y)
+        own_transform = _matrix(prediction.rotation[0], prediction.translation[0])[None]
+        if prediction.correspondence is None:
+            return Hypotheses(own_transform, *_NO_MATCHES)
+        prob = prediction.correspondence.prob()[0, :, : y.shape[1]]
+        # The strongest entries that are the maximum of their row or of their column.
+        is_max = (prob == prob.amax(0)) | (prob == prob.amax(1, keepdim=True))
+        weight, place = (prob * is_max).flatten().topk(min(self.num_matches, prob.numel()))
+        weight, place = weight[weight > 0], place[weight > 0]
+        i, j = place // prob.shape[1], place % prob.shape[1]
+        rotation, translation, _ = ransac_on_matches(
+            x[0, i, :3],
+            y[0, j, :3],
+            weight.sqrt(),
+            self.inlier_threshold,
+            generator=torch.Generator().manual_seed(seed),
+            count=self.count,
+        )
+        transforms = [_matrix(r, t) for r, t in zip(rotation, translation, strict=True)]
+        matches = torch.stack([i, j], 1).numpy()
+        return Hypotheses(np.stack([*transforms, *own_transform]), matches, weight.double().numpy())
+
+
+def _matrix(rotation: torch.Tensor, translation: torch.Tensor) -> np.ndarray:
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = rotation.double(), translation.double()
+    return transform
+
+
+def icp(source: np.ndarray, target: np.ndarray, seed: int) -> Hypotheses:
+    """Return one hypothesis, centroid on centroid: everything else is left to ICP."""
+    transform = np.eye(4)
+    transform[:3, 3] = target[:, :3].mean(0) - source[:, :3].mean(0)
+    return Hypotheses(transform[None], *_NO_MATCHES)
+
+
+class ClassicalSettings(NamedTuple):
+    """Lengths and counts of the classical pipelines."""
+
+    feature_radius: float
+    inlier_threshold: float
+    mutual: bool = True  # RANSAC only: keep matches that are each other's best
+    feature_neighbors: int = 100
+    iterations: int = 100_000
+
+
+# The best settings that benchmarks/tune_classical.py tries on validation pairs.
+RANSAC = ClassicalSettings(feature_radius=0.65, inlier_threshold=0.12)
+FGR = ClassicalSettings(feature_radius=0.65, inlier_threshold=0.05)
+
+
+def ransac(
+    source: np.ndarray, target: np.ndarray, seed: int, settings: ClassicalSettings = RANSAC
+) -> Hypotheses:
+    """Run RANSAC over matches of FPFH features (Rusu et al., ICRA 2009; Open3D)."""
+    o3d, clouds, features = _fpfh(source, target, settings)
+    registration = o3d.pipelines.registration
+    o3d.utility.random.seed(seed)
+    result = registration.registration_ransac_based_on_feature_matching(
+        *clouds,
+        *features,
+        settings.mutual,
+        settings.inlier_threshold,
+        registration.TransformationEstimationPointToPoint(False),
+        3,
+        [
+            registration.CorrespondenceCheckerBasedOnEdgeLength(0.9),
+            registration.CorrespondenceCheckerBasedOnDistance(settings.inlier_threshold),
+        ],
+        registration.RANSACConvergenceCriteria(settings.iterations, 0.999),
+    )
+    return Hypotheses(np.asarray(result.transformation)[None].copy(), *_NO_MATCHES)
+
+
+def fgr(
+    source: np.ndarray, target: np.ndarray, seed: int, settings: ClassicalSettings = FGR
+) -> Hypotheses:
+    """Run Fast Global Registration over FPFH features (Zhou et al., ECCV 2016; Open3D)."""
+    o3d, clouds, features = _fpfh(source, target, settings)
+    registration = o3d.pipelines.registration
+    o3d.utility.random.seed(seed)
+    option = registration.FastGlobalRegistrationOption(
+        maximum_correspondence_distance=settings.inlier_threshold
+    )
+    result = registration.registration_fgr_based_on_feature_matching(*clouds, *features, option)
+    return Hypotheses(np.asarray(result.transformation)[None].copy(), *_NO_MATCHES)
+
+
+def _fpfh(
+    source: np.ndarray, target: np.ndarray, settings: ClassicalSettings
+) -> tuple[Any, list[Any], list[Any]]:
+    """Compute Open3D's clouds and FPFH features; return them behind the open3d module."""
+    try:
+        o3d: Any = importlib.import_module("open3d")
+    except ImportError as error:
+        raise CorrmatError("ransac and fgr are Open3D's: pip install open3d") from error
+    clouds, features = [], []
+    for points in (source, target):
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[:, :3].astype(float)))
+        cloud.normals = o3d.utility.Vector3dVector(points[:, 3:].astype(float))
+        search = o3d.geometry.KDTreeSearchParamHybrid(
+            settings.feature_radius, settings.feature_neighbors
+        )
+        clouds.append(cloud)
+        features.append(o3d.pipelines.registration.compute_fpfh_feature(cloud, search))
+    return o3d, clouds, features
+
+
+CLASSICAL: dict[str, HypothesisGenerator] = {"icp": icp, "ransac": ransac, "fgr": fgr}

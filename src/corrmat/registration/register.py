@@ -1,0 +1,259 @@
+"""Register two clouds: the rigid transform between them, its matches and its confidence."""
+
+import functools
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from corrmat.data.normals import estimate_normals
+from corrmat.errors import CorrmatError
+from corrmat.registration.hypotheses import CLASSICAL, HypothesisGenerator, NetworkHypotheses
+from corrmat.registration.scoring import AlignmentScorer
+from corrmat.weights import Calibration, load_model, shipped_calibration
+
+Refine = Literal["icp", "none"]
+MODEL_POINTS = 1024  # points of either cloud for the model
+SELECTION_POINTS = 2048  # to select among its hypotheses
+FULL_POINTS = 20_000  # to refine the selected one
+MEDIAN = 0.6  # median distance from the centroid after scaling: a radius of about one
+MIN_CONFIDENCE = 0.5  # of the verdict "aligned"
+MAX_NORMAL = 1.01  # longest given normal
+_LINE = 1e-6  # a cloud that is thinner, relative to its length, is a line
+
+
+@dataclass(frozen=True)
+class Registration:
+    """The rigid transform that takes a source onto a target, and how far to trust it."""
+
+    transform: np.ndarray  # (4, 4) float64, T_target_source in the clouds' own units
+    matches: np.ndarray  # (K, 2) int64 rows of source and target; K = 0 for models without
+    match_confidence: np.ndarray  # (K,) in [0, 1]; neighbours of the same point share it
+    match_agrees: np.ndarray  # (K,) bool: whether the transform takes one end near the other
+    agreement: float  # in [0, 1]: how much of either cloud lies on the other
+    support: float  # in [0, 1]: share of the matches that the transform explains; 1 without any
+    confidence: float  # in [0, 1]: calibrated chance that the clouds are aligned
+    rmse: float  # of aligned source points near a target point, in the clouds' units
+    overlap: float  # share of source points near a target point
+    verdict: str  # "aligned", or "doubtful: " and why
+    model: str
+    seed: int
+    seconds: float
+
+    @property
+    def rotation_deg(self) -> float:
+        """The rotation's angle."""
+        cosine = (np.trace(self.transform[:3, :3]) - 1) / 2
+        return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+
+def register(
+    source: np.ndarray,
+    target: np.ndarray,
+    *,
+    model: str | Path = "corrmat",
+    refine: Refine = "icp",
+    seed: int = 0,
+) -> Registration:
+    """Find the rigid transform that takes the source onto the target.
+
+    The clouds may be in any units, overlap in part, share no point, and have outliers. The same
+    points in any order, with the same seed, give the same matrix.
+
+    Args:
+        source: (N, 3), or (N, 6) with unit normals.
+        target: (M, 3), or (M, 6).
+        model: "corrmat" for the shipped weights; "icp", "ransac" or "fgr" for the classical
+            pipelines; or a checkpoint file.
+        refine: "icp" on up to 20,000 points of each cloud after the model, or "none".
+        seed: of subsampling and of the model's random draws.
+
+    Returns:
+        The registration, in the units of the clouds.
+
+    Raises:
+        CorrmatError: the points are not a cloud, or do not determine a rotation; the model is
+            unknown.
+    """
+    if refine not in ("icp", "none"):
+        raise CorrmatError(f"refine = {refine!r}; choices: icp, none")
+    if seed < 0:
+        raise CorrmatError(f"seed = {seed} is negative")
+    generate: HypothesisGenerator = CLASSICAL.get(str(model)) or _load_network(str(model))
+    start = time.perf_counter()
+    x, y = Cloud.of(source, "source", seed), Cloud.of(target, "target", seed)
+    scale = 2 * MEDIAN / (x.median + y.median)
+    subsamples = x.with_normals(scale, MODEL_POINTS), y.with_normals(scale, MODEL_POINTS)
+    hypotheses = generate(*subsamples, seed)
+    scorer = AlignmentScorer(x.points(scale, SELECTION_POINTS), y.points(scale, SELECTION_POINTS))
+    transforms = hypotheses.transforms
+    if refine == "icp":
+        transforms = np.stack([scorer.refine(transform) for transform in transforms])
+    agreements = [scorer.agreement(transform) for transform in transforms]
+    supports = [hypotheses.support(transform, *subsamples) for transform in transforms]
+    best = int(np.argmax(np.multiply(agreements, supports)))
+    transform, agreement, support = transforms[best], agreements[best], supports[best]
+    full = AlignmentScorer(x.points(scale, FULL_POINTS), y.points(scale, FULL_POINTS))
+    if refine == "icp":
+        transform = full.refine(transform)
+    has_matches = len(hypotheses.matches) > 0
+    confidence = _calibration().confidence(agreement, support if has_matches else None)
+    overlap, rmse = full.overlap_and_rmse(transform)
+    rows = [cloud.rows[m] for cloud, m in zip((x, y), hypotheses.matches.T, strict=True)]
+    return Registration(
+        transform=_to_original_units(transform, scale, x.centre, y.centre),
+        matches=np.stack(rows, 1),
+        match_confidence=hypotheses.confidence,
+        match_agrees=hypotheses.match_support(transforms[best], *subsamples) > 0,
+        agreement=agreement,
+        support=support,
+        confidence=confidence,
+        rmse=rmse / scale,
+        overlap=overlap,
+        verdict=_verdict(confidence, overlap),
+        model=str(model),
+        seed=seed,
+        seconds=time.perf_counter() - start,
+    )
+
+
+class Cloud:
+    """At most `FULL_POINTS` points of a user's cloud, in canonical order, and their centroid.
+
+    They are ordered by a hash of coordinates and seed, so that the first n are a random subsample
+    that does not depend on the order of the user's rows.
+    """
+
+    def __init__(self, rows: np.ndarray, values: np.ndarray) -> None:
+        self.rows, self.values = rows, values
+        self.centre = values[:, :3].mean(0)
+        self.centred = values[:, :3] - self.centre
+        self.median = float(np.median(np.linalg.norm(self.centred, axis=1)))
+
+    @classmethod
+    def of(cls, cloud: np.ndarray, name: str, seed: int) -> "Cloud":
+        """Check a cloud and bring it into canonical order.
+
+        Raises:
+            CorrmatError: see `register`.
+        """
+        values = np.asarray(cloud, np.float64)
+        if values.ndim != 2 or values.shape[1] not in (3, 6):
+            raise CorrmatError(f"{name}: array of shape {values.shape}, not (N, 3) or (N, 6)")
+        if len(values) < 3:
+            raise CorrmatError(f"{name}: {len(values)} points; a rotation needs at least 3")
+        bad = np.flatnonzero(~np.isfinite(values).all(1))
+        if len(bad):
+            raise CorrmatError(
+                f"{name}: {len(bad)} points are NaN or infinite, the first is row {bad[0]}"
+            )
+        longest = np.linalg.norm(values[:, 3:], axis=1).max(initial=0)
+        if longest > MAX_NORMAL:
+            raise CorrmatError(
+                f"{name}: columns 4 to 6 are no unit normals (one has length {longest:.3g}); pass "
+                "the points alone, (N, 3), and normals are estimated"
+            )
+        rank = _hash(values, seed)
+        size = min(FULL_POINTS, len(rank))
+        few = np.argpartition(rank, size)[:size] if len(rank) > size else np.arange(size)
+        rows = few[np.argsort(rank[few])]
+        checked = cls(rows, values[rows])
+        length, breadth, _ = np.linalg.svd(checked.centred, compute_uv=False)[:3]
+        noise = 1e-12 * np.abs(checked.values[:, :3]).max() * np.sqrt(len(rows))
+        if length <= noise:
+            raise CorrmatError(f"{name}: all points are equal; the rotation is not determined")
+        if breadth <= max(_LINE * length, noise):
+            raise CorrmatError(
+                f"{name}: all points lie on one line; the rotation is not determined"
+            )
+        if not checked.median:
+            raise CorrmatError(f"{name}: most points are equal; there is no shape to register")
+        return checked
+
+    def points(self, scale: float, count: int) -> np.ndarray:
+        """Return the first points, (n, 3), centred and scaled."""
+        return self.centred[:count] * scale
+
+    def with_normals(self, scale: float, count: int) -> np.ndarray:
+        """Return the first points with normals, (n, 6); missing normals are estimated from them."""
+        points = self.points(scale, count)
+        given = self.values[:count, 3:]
+        return np.hstack([points, given if given.shape[1] else estimate_normals(points)])
+
+
+def _hash(values: np.ndarray, seed: int) -> np.ndarray:
+    """Hash every row to 64 bits by the finaliser of splitmix64 (Steele et al., 2014)."""
+    state = np.full(len(values), seed, np.uint64)
+    for column in np.ascontiguousarray((values + 0.0).T).view(np.uint64):  # + 0.0: no minus zero
+        state = state * np.uint64(0x9E3779B97F4A7C15) ^ column
+        state = (state ^ state >> np.uint64(30)) * np.uint64(0xBF58476D1CE4E5B9)
+        state = (state ^ state >> np.uint64(27)) * np.uint64(0x94D049BB133111EB)
+        state ^= state >> np.uint64(31)
+    return state
+
+
+@functools.cache
+def _calibration() -> Calibration:
+    return shipped_calibration()
+
+
+def _load_network(model: str) -> NetworkHypotheses:
+    """Load a model, kept in memory until its file changes."""
+    path = Path(model)
+    stat = path.stat() if path.is_file() else None
+    return _cached_network(model, stat and (str(path.resolve()), stat.st_mtime_ns, stat.st_size))
+
+
+@functools.lru_cache(maxsize=4)
+def _cached_network(model: str, file: tuple[str, int, int] | None) -> NetworkHypotheses:
+    return NetworkHypotheses(load_model(model))
+
+
+def to_text(registration: Registration) -> str:
+    """Format a registration for people."""
+    rows = [
+        "  ".join(f"{value: .12g}".rjust(20) for value in row) for row in registration.transform
+    ]
+    x, y, z = registration.transform[:3, 3]
+    lines = [
+        "matrix (target = matrix @ source):",
+        *rows,
+        f"rotation     {registration.rotation_deg:.3f} deg",
+        f"translation  {x:.6g} {y:.6g} {z:.6g}",
+        f"overlap      {registration.overlap:.1%} of the source has a target point near",
+        f"RMSE         {registration.rmse:.6g} of those",
+    ]
+    if len(registration.matches):
+        agree, matches = registration.match_agrees.sum(), len(registration.matches)
+        lines.append(f"matches      {agree} of {matches} agree with the transform")
+    lines += [f"confidence   {registration.confidence:.0%}", f"verdict      {registration.verdict}"]
+    return "\n".join(
+        [*lines, f"({registration.model}, seed {registration.seed}, {registration.seconds:.2f} s)"]
+    )
+
+
+def to_json(registration: Registration) -> str:
+    """Format a registration for programs."""
+    names = ("confidence", "rmse", "overlap", "verdict", "model", "seed", "seconds")
+    values = {name: getattr(registration, name) for name in names}
+    if not np.isfinite(registration.rmse):
+        values["rmse"] = None
+    return json.dumps({"transform": registration.transform.tolist(), **values}, indent=1) + "\n"
+
+
+def _to_original_units(
+    transform: np.ndarray, scale: float, centre_x: np.ndarray, centre_y: np.ndarray
+) -> np.ndarray:
+    """Convert a transform of centred, scaled clouds to the user's coordinates."""
+    converted = transform.copy()
+    converted[:3, 3] = centre_y + transform[:3, 3] / scale - transform[:3, :3] @ centre_x
+    return converted
+
+
+def _verdict(confidence: float, overlap: float) -> str:
+    if confidence >= MIN_CONFIDENCE:
+        return "aligned"
+    return f"doubtful: {overlap:.0%} of the source lies on the target"

@@ -1,0 +1,1 @@
+"""Records of experiments, and their tables, figures and pages."""

@@ -1,0 +1,157 @@
+"""Rewrites the tables of README.md and docs/, and redraws their pictures, from results/."""
+
+import itertools
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+from corrmat.errors import CorrmatError
+from corrmat.files import replace_text
+from corrmat.metrics import ADDS_THRESHOLD
+from corrmat.reporting.record import Record, read_records
+from corrmat.reporting.tables import markdown_row, markdown_summary, markdown_tables
+from corrmat.reporting.writer import draw_record
+from corrmat.weights import shipped_calibration
+
+
+def register_table(results: Path) -> str:
+    """Build the table of `corrmat register`: a row a set of pairs, a column a model."""
+    records = [json.loads(path.read_text()) for path in sorted(results.glob("register/*-*.json"))]
+    if not records:
+        return "No comparison is recorded; `make protocols` makes them."
+    models = list(records[0]["models"])
+    heads = ["pairs", "data", "points", *models]
+    lines = [markdown_row(heads), "|" + "---|" * len(heads)]
+    for record in sorted(records, key=lambda r: (r["protocol"] != "real", r["data"], r["points"])):
+        cells = []
+        for model in models:
+            row = record["models"].get(model)
+            recalls = row and f"{row['recall_5deg']:.0%} / {row['recall_adds']:.0%}"
+            cells.append(f"{recalls}, {row['ms']:.0f} ms" if row else "")
+        start = [record["protocol"], record["data"], str(record["points"])]
+        lines.append(markdown_row([*start, *cells]))
+    return "\n".join(lines)
+
+
+def networks_table(results: Path) -> str:
+    """Build the table of other networks of this project in the shipped one's place."""
+    path = results / "register" / "networks.json"
+    if not path.is_file():
+        return "No comparison is recorded."
+    lines = [markdown_row(["network", "recall at 5 deg", "recall ADD-S"]), "|---|---|---|"]
+    for name, row in json.loads(path.read_text())["models"].items():
+        parts = Path(name).parts
+        label = f"{parts[-2]}, experiment {parts[-3]}" if len(parts) > 2 else f"{name} (shipped)"
+        recalls = [f"{row['recall_5deg']:.0%}", f"{row['recall_adds']:.0%}"]
+        lines.append(markdown_row([label, *recalls]))
+    return "\n".join(lines)
+
+
+def confidence_table(results: Path) -> str:
+    """Build the table of what the confidence promised and how often the clouds were aligned."""
+    calibration = shipped_calibration()
+    heads = ["data", "confidence", "pairs", "promised", "aligned"]
+    lines = [markdown_row(heads), "|---|---|---|---|---|"]
+    for data in ("shapes", "modelnet40"):
+        promised: list[float] = []
+        aligned: list[bool] = []
+        for path in sorted((results / "register").glob(f"*-{data}-*.json")):
+            pairs = json.loads(path.read_text())["models"]["corrmat"]["per_pair"]
+            scores = zip(pairs["agreement"], pairs["support"], strict=True)
+            promised += [calibration.confidence(*score) for score in scores]
+            aligned += [distance < ADDS_THRESHOLD for distance in pairs["adds"]]
+        for low, high in itertools.pairwise((0, 0.25, 0.5, 0.75, 1)):
+            inside = [i for i, value in enumerate(promised) if low <= value < high]
+            if inside:
+                means = [sum(v[i] for i in inside) / len(inside) for v in (promised, aligned)]
+                cells = [f"{low:.0%} to {high:.0%}", str(len(inside)), *(f"{m:.0%}" for m in means)]
+                lines.append(markdown_row([data, *cells]))
+    return "\n".join(lines)
+
+
+def bench_table(results: Path) -> str:
+    """Build the table of docs/speed.md: every row of the last `make bench`."""
+    path = results / "bench" / "bench.json"
+    if not path.is_file():
+        return "No benchmark is recorded."
+    bench = json.loads(path.read_text())
+    heads = ["what", "ms", "peak memory, MB", "share of the matrix product's GFLOP/s"]
+    lines = [markdown_row([*heads, "the other way takes"]), "|---" * 5 + "|"]
+    lines += [_bench_row(row) for row in bench["rows"] if "not_measured" not in row]
+    lines += [""] + [
+        f"- {what}, one pair of N points: time grows with N^{by['seconds']} (from N = 1024 on), "
+        f"memory with N^{by['peak_mb']} (from N = 4096 on, where no matrix is whole)."
+        for what, by in bench["exponents"].items()
+    ]
+    lines += ["", "Minutes of training an arm of a laptop recipe, alone on the machine:", ""]
+    for recipe, arms in bench["recipes"].items():
+        lines.append(f"- {recipe}: " + ", ".join(f"{arm} {m}" for arm, m in arms.items()))
+    machine = f"{bench['threads']} threads ({bench['instructions']}), torch {bench['torch']}"
+    return "\n".join([f"Measured with {machine}.", "", *lines])
+
+
+def _bench_row(row: dict[str, float | str]) -> str:
+    """Format a row of bench.json."""
+    per_pair = "ms_a_pair" in row
+    ms = row.get("ms_a_pair", row.get("ms"))
+    if ms is None and "seconds" in row:
+        ms = float(row["seconds"]) * 1e3
+    if ms is None:
+        time = f"{row['gflops']} GFLOP/s" if "gflops" in row else ""
+    else:
+        time = f"{float(ms):.3g}" if float(ms) < 100 else f"{float(ms):,.0f}"
+    ratios = [f"{v} x ({k.removesuffix('_ratio')})" for k, v in row.items() if "_ratio" in k]
+    if "released_peak_mb" in row:
+        ratios.append(f"{row['released_peak_mb']} MB")
+    share = f"{float(row['peak_share']):.0%}" if "peak_share" in row else ""
+    what = f"{row['what']} (a pair)" if per_pair else str(row["what"])
+    return markdown_row([what, time, str(row.get("peak_mb", "")), share, ", ".join(ratios)])
+
+
+# document, mark in it, content from the records and the folder results/
+TABLES: tuple[tuple[str, str, Callable[[list[Record], Path], str]], ...] = (
+    ("README.md", "results", lambda records, _: markdown_summary(records)),
+    ("README.md", "register", lambda _, results: register_table(results)),
+    ("docs/reproduction.md", "tables", lambda records, _: markdown_tables(records)),
+    ("docs/register.md", "networks", lambda _, results: networks_table(results)),
+    ("docs/register.md", "confidence", lambda _, results: confidence_table(results)),
+    ("docs/speed.md", "bench", lambda _, results: bench_table(results)),
+)
+
+
+def rewrite_documents(results: Path, root: Path) -> int:
+    """Rewrite every table of the documents and redraw the records' pictures.
+
+    Args:
+        results: folder of records.
+        root: folder of README.md and docs/.
+
+    Returns:
+        The number of records.
+
+    Raises:
+        CorrmatError: a document, or a mark in it, is missing.
+    """
+    records = read_records(results, scale="laptop")
+    for record in records:
+        draw_record(results / record.place)
+    for page, mark, content in TABLES:
+        replace_between_marks(root / page, mark, content(records, results))
+    return len(records)
+
+
+def replace_between_marks(path: Path, name: str, content: str) -> None:
+    """Replace the text between `<!-- name -->` and `<!-- /name -->` in a file.
+
+    Raises:
+        CorrmatError: the file or the marks are missing.
+    """
+    if not path.is_file():
+        raise CorrmatError(f"no {path} to write into")
+    text = path.read_text()
+    start, end = f"<!-- {name} -->", f"<!-- /{name} -->"
+    if start not in text or end not in text:
+        raise CorrmatError(f"{path} has no {start} ... {end} to write into")
+    before, rest = text.split(start, 1)
+    after = rest.split(end, 1)[1]
+    replace_text(path, f"{before}{start}\n{content}\n{end}{after}")

@@ -1,0 +1,216 @@
+"""Figures of a record: the paper's curves, and which points were matched with which."""
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter, NullFormatter
+
+from corrmat.files import replace_bytes
+from corrmat.reporting.record import ArmResult, Record, Subset, defined
+from corrmat.reporting.snapshots import PairSnapshot, Stage, match_accuracy, stages
+from corrmat.reporting.tables import METRICS
+
+# The columns of the paper's figures 5, 6 and 7, by family.
+PANELS = {
+    "DCP": ("loss", "match_accuracy", "relative_euler_rmse_deg", "translation_rmse"),
+    "RPMNet": ("loss", "match_accuracy", "rotation_error_deg_mean", "chamfer"),
+    "PCRNet": ("loss", "match_accuracy", "naive_euler_rmse_deg", "rotation_error_deg_mean"),
+}
+_OTHER_PANELS = ("loss", "match_accuracy", "rotation_error_deg_mean", "translation_rmse")
+_BAND_PANELS = ("match_accuracy", "relative_euler_mae_deg", "chamfer")
+_SWEEP_PANELS = ("match_accuracy", "relative_euler_rmse_deg")
+RED, BLUE, GREEN, PURPLE = "#d62728", "#1f77b4", "#2ca02c", "#9467bd"
+MAX_LINES = 150  # matches drawn
+
+
+class CurveSeries(NamedTuple):
+    """An arm's values, or those that the paper reports for it."""
+
+    arm: str
+    colour: str
+    x: list[float]
+    y: list[float]
+    paper: bool = False
+
+
+class Panel(NamedTuple):
+    """One pair of axes."""
+
+    title: str
+    xlabel: str
+    log_x: bool
+    log_y: bool
+    series: list[CurveSeries]
+
+
+def arm_colours(record: Record) -> dict[str, str]:
+    """Assign colours as the paper does: METHOD red, METHOD_corr blue, controls others."""
+    colours = dict(zip(record.controls, (GREEN, PURPLE, "#8c564b"), strict=False))
+    colours |= {record.treatment: BLUE} | ({record.baseline: RED} if record.baseline else {})
+    return {arm: colours.get(arm, "#7f7f7f") for arm in record.arms}
+
+
+def panels(record: Record) -> list[Panel]:
+    """Describe the curves of a record.
+
+    They show validation during training against pairs seen, in the paper's columns (`PANELS`).
+    Tests in bands of initial misalignment (1.4 and 2.4) are shown against the band instead, and
+    tests with other shares of outliers against the share.
+    """
+    first = next(iter(record.arms.values()))
+    if first.bands:
+        return [_subset_panel(record, name, "bands") for name in _BAND_PANELS]
+    names = PANELS.get(record.family, _OTHER_PANELS)
+    sweep = [_subset_panel(record, name, "sweep") for name in _SWEEP_PANELS if first.sweep]
+    return [_training_panel(record, name) for name in names] + sweep
+
+
+def _training_panel(record: Record, name: str) -> Panel:
+    """Describe the curves of one validation metric (or of the training loss)."""
+    title, _, factor = METRICS.get(name, ("training loss", "", 1))
+    series: list[CurveSeries] = []
+    lengths = []
+    for arm, colour, result in _arms(record):
+        pairs = [point["pairs_seen"] for point in result.curve]
+        lengths.append(max(pairs, default=1))
+        values = [defined(point.get(name)) for point in result.curve]
+        if pairs and None not in values:
+            y = [factor * value for value in values if value is not None]
+            series.append(CurveSeries(arm, colour, pairs, y))
+        final = record.paper[arm].get(name) if arm in record.paper else None
+        if pairs and final is not None:
+            ends = [min(pairs[0], pairs[-1] // 2), pairs[-1]]
+            series.append(CurveSeries(arm, colour, ends, [factor * final] * 2, paper=True))
+    log_x = max(lengths) > 4 * min(lengths)  # PCRNet's arms get equal minutes, not equal pairs
+    log_y = name not in ("loss", "match_accuracy")
+    return Panel(title, "training pairs seen", log_x, log_y, series)
+
+
+def _subset_panel(record: Record, name: str, part: str) -> Panel:
+    """Describe a metric against rotation bands or shares of outliers."""
+    title, _, factor = METRICS[name]
+    series: list[CurveSeries] = []
+    for arm, colour, result in _arms(record):
+        for source, paper in ((result, False), (record.paper.get(arm), True)):
+            subsets: list[Subset] = getattr(source, part) if source else []
+            points = [(s.position, defined(s.metrics.get(name))) for s in subsets]
+            available = [(x, factor * y) for x, y in points if y is not None]
+            if available:
+                x, y = map(list, zip(*available, strict=True))
+                series.append(CurveSeries(arm, colour, x, y, paper))
+    xlabel = "initial misalignment, deg" if part == "bands" else "outliers in the test, %"
+    return Panel(title, xlabel, False, name != "match_accuracy", series)
+
+
+def _arms(record: Record) -> Iterator[tuple[str, str, ArmResult]]:
+    colours = arm_colours(record)
+    for arm, result in record.arms.items():
+        yield arm, colours[arm], result
+
+
+def grid(number: int) -> tuple[int, int]:
+    """Return rows and columns for this number of panels."""
+    rows = -(-number // 4)
+    return rows, -(-number // rows)
+
+
+class _PlainLogFormatter(LogFormatter):
+    """Label minor ticks where there is room, as 0.2 and not as 2e-01."""
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        return super().__call__(x, pos) and f"{x:g}"
+
+
+def draw_curves(record: Record, path: Path) -> None:
+    """Draw `panels` of a record as a PNG; the paper's values are dotted."""
+    all_panels = panels(record)
+    rows, columns = grid(len(all_panels))
+    figure = Figure(figsize=(3.75 * columns, 3.6 * rows + 0.4), layout="constrained")
+    figure.suptitle(f"{record.id}  {record.title}  ({record.scale}, {record.data})")
+    for axes, panel in zip(figure.subplots(rows, columns).flat, all_panels, strict=True):
+        for series in panel.series:
+            style = {"linestyle": ":", "linewidth": 1} if series.paper else {"marker": "."}
+            label = f"paper, {series.arm}" if series.paper else series.arm
+            axes.plot(series.x, series.y, color=series.colour, label=label, **style)
+        if panel.log_x:
+            axes.set_xscale("log")
+            axes.xaxis.set_minor_formatter(NullFormatter())
+        if panel.log_y:
+            axes.set_yscale("log")
+            axes.yaxis.set_major_formatter("{x:g}")
+            axes.yaxis.set_minor_formatter(_PlainLogFormatter(minor_thresholds=(1, 0.4)))
+        axes.set(title=panel.title, xlabel=panel.xlabel)
+        axes.grid(alpha=0.3)
+    lines = {line.get_label(): line for axes in figure.axes for line in axes.lines}
+    figure.legend(handles=list(lines.values()), loc="outside lower center", ncols=4)
+    save(figure, path)
+
+
+def draw_matches(snapshot: PairSnapshot, title: str, path: Path) -> None:
+    """Draw a pair before and after, right matches green and wrong ones red (paper, figure 8).
+
+    The source is black and the target blue. Points called outliers have a ring, which is red if
+    they are inliers.
+
+    Args:
+        snapshot: the pair.
+        title: above the figure.
+        path: of the PNG.
+    """
+    before, *_, after = stages(snapshot)
+    boxes = [_box(_project(np.concatenate([s.source, s.target]))) for s in (before, after)]
+    widths = [min(max(box[0] / box[1], 1), 3) for box in boxes]  # room for the headings
+    height = min(1 + 10 / sum(widths), 6)
+    figure = Figure(figsize=(10, height), layout="constrained")
+    figure.suptitle(f"{title}: {100 * match_accuracy(snapshot):.0f} % of the matches are right")
+    headings = "source, target set aside, matches", "registered"
+    both = figure.subplots(1, 2, width_ratios=widths)
+    for axes, stage, heading in zip(both, (before, after), headings, strict=True):
+        source, target = _project(stage.source), _project(stage.target)
+        axes.add_collection(_match_lines(stage, source, target))
+        axes.scatter(*target.T, s=22, color="#9ecae9", linewidths=0, label="target")
+        axes.scatter(*source.T, s=4, color="black", linewidths=0, label="source")
+        outlier = stage.called_outlier
+        if outlier.any():
+            rings = np.where(stage.correct[outlier], GREEN, RED)
+            axes.scatter(
+                *source[outlier].T, s=60, facecolors="none", edgecolors=rings,
+                label="called outlier",
+            )  # fmt: skip
+        axes.set(title=heading, aspect="equal")
+        axes.set_axis_off()
+    both[1].legend(fontsize="x-small", loc="best")
+    save(figure, path)
+
+
+def _match_lines(stage: Stage, source: np.ndarray, target: np.ndarray) -> LineCollection:
+    """Draw lines between matched points of projected clouds (N, 2) and (M, 2)."""
+    drawn = np.flatnonzero(~stage.called_outlier)[:MAX_LINES]
+    ends = np.stack([source[drawn], target[stage.matched[drawn]]], 1)
+    colours = np.where(stage.correct[drawn], GREEN, RED)
+    return LineCollection(list(ends), colors=list(colours), lw=0.5, alpha=0.6, zorder=1)
+
+
+def _project(points: np.ndarray) -> np.ndarray:
+    """Project points (N, 3) to (N, 2), seen from a little aside and above, orthographically."""
+    azimuth, elevation = np.radians((10, 20))
+    right = [np.cos(azimuth), np.sin(azimuth), 0]
+    up_xy = np.sin(elevation) * np.array([np.sin(azimuth), -np.cos(azimuth)])
+    return points @ np.array([right, [*up_xy, np.cos(elevation)]]).T
+
+
+def _box(points: np.ndarray) -> np.ndarray:
+    """Return width and height of projected points."""
+    return np.ptp(points, 0).clip(1e-3)
+
+
+def save(figure: Figure, path: Path, dpi: int = 110) -> None:
+    """Write a PNG atomically; the same figure gives the same bytes."""
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=dpi, metadata={"Software": None})
+    replace_bytes(path, content.getbuffer())

@@ -1,0 +1,155 @@
+"""Interactive plots of the page, as plotly's plain dictionaries."""
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from corrmat.reporting.figures import BLUE, GREEN, RED, arm_colours, grid, panels
+from corrmat.reporting.record import Record
+from corrmat.reporting.snapshots import PairSnapshot, Stage, stages
+
+Plot = dict[str, object]
+"""A plotly figure: `data` and `layout`."""
+QUANTILES = np.linspace(0, 1, 101)
+_TRACES = 5  # of a stage
+_MAX_POINTS, _MAX_LINES = 120, 70  # drawn of a cloud, of the matches: the page stays small
+
+
+def curves_plot(record: Record) -> Plot:
+    """Plot `figures.panels` of a record."""
+    all_panels = panels(record)
+    rows, columns = grid(len(all_panels))
+    data: list[Plot] = []
+    layout: Plot = {
+        "grid": {"rows": rows, "columns": columns, "pattern": "independent"},
+        "margin": {"t": 40, "r": 10},
+        "legend": {"orientation": "h", "y": -0.25 / rows},
+        "height": 330 * rows,
+    }
+    for index, panel in enumerate(all_panels):
+        suffix = "" if index == 0 else str(index + 1)
+        for series in panel.series:
+            in_legend = all(trace.get("name") != series.arm for trace in data)
+            label: Plot = {"name": series.arm, "showlegend": in_legend}
+            line = {"color": series.colour}
+            if series.paper:
+                label = {"name": f"paper, {series.arm}", "mode": "lines", "showlegend": False}
+                line["dash"] = "dot"
+            axes = {"xaxis": f"x{suffix}", "yaxis": f"y{suffix}", "legendgroup": series.arm}
+            data.append(axes | {"x": series.x, "y": series.y, "line": line} | label)
+        for axis, log, text in (("x", panel.log_x, panel.xlabel), ("y", panel.log_y, panel.title)):
+            title = {"text": text, "standoff": 4}
+            layout[f"{axis}axis{suffix}"] = {"type": "log" if log else "linear", "title": title}
+    return {"data": data, "layout": layout}
+
+
+def errors_plot(per_pair: Path, record: Record) -> Plot:
+    """Plot the empirical distribution of rotation errors, a line an arm or baseline.
+
+    Args:
+        per_pair: per_pair.csv of the record.
+        record: names and colours of the arms.
+    """
+    errors: dict[str, list[float]] = {}
+    with per_pair.open() as file:
+        for row in csv.DictReader(file):
+            errors.setdefault(row["arm"], []).append(float(row["rotation_error_deg"]))
+    colours = arm_colours(record)
+    data = []
+    for arm, values in errors.items():
+        quantiles = np.quantile(np.nan_to_num(values, nan=180.0), QUANTILES, method="inverted_cdf")
+        style = {"color": colours.get(arm, "#888"), "dash": "solid" if arm in colours else "dash"}
+        x = [float(f"{max(value, 1e-4):.4g}") for value in quantiles]
+        share = (100 * QUANTILES).round(1).tolist()
+        data.append({"x": x, "y": share, "name": arm, "line": style})
+    layout = {
+        "xaxis": {"type": "log", "title": {"text": "rotation error, deg"}},
+        "yaxis": {"title": {"text": "% of test pairs below"}},
+        "margin": {"t": 20, "r": 10},
+    }
+    return {"data": data, "layout": layout}
+
+
+def snapshot_plot(snapshot: PairSnapshot) -> Plot:
+    """Plot a pair in 3-D, with a slider over the network's iterations."""
+    scenes = stages(snapshot)
+    data = []
+    for index, stage in enumerate(scenes):
+        visible = {"visible": index == len(scenes) - 1}
+        data += [trace | visible for trace in _stage_traces(stage)]
+    steps = [
+        {
+            "label": stage.label,
+            "method": "restyle",
+            "args": [{"visible": [i // _TRACES == index for i in range(len(data))]}],
+        }
+        for index, stage in enumerate(scenes)
+    ]
+    hidden = {"visible": False}
+    layout = {
+        "scene": {"aspectmode": "data", "xaxis": hidden, "yaxis": hidden, "zaxis": hidden},
+        "sliders": [{"active": len(scenes) - 1, "steps": steps}],
+        "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
+        "legend": {"orientation": "h"},
+    }
+    return {"data": data, "layout": layout}
+
+
+def _stage_traces(stage: Stage) -> list[Plot]:
+    """Plot one stage: clouds, right and wrong matches, outliers."""
+    outlier, correct = stage.called_outlier, stage.correct
+    return [
+        point_trace(_thin(stage.target), "target", BLUE),
+        point_trace(_thin(stage.source), "source", "#000"),
+        _match_trace(stage, correct & ~outlier, "right matches", GREEN),
+        _match_trace(stage, ~correct & ~outlier, "wrong matches", RED),
+        point_trace(stage.source[outlier], "called outlier", "#ff7f0e", "circle-open", 6),
+    ]
+
+
+def _thin(points: np.ndarray) -> np.ndarray:
+    """Take every so many points."""
+    return points[:: -(-len(points) // _MAX_POINTS)]
+
+
+def point_trace(
+    points: np.ndarray, name: str, colour: str, symbol: str = "circle", size: int = 2
+) -> Plot:
+    """Build a 3-D scatter trace of points (N, 3)."""
+    x, y, z = points.round(3).T.tolist() if len(points) else ([], [], [])
+    marker = {"size": size, "color": colour, "symbol": symbol}
+    common: Plot = {"type": "scatter3d", "mode": "markers", "hoverinfo": "skip"}
+    return common | {"x": x, "y": y, "z": z, "name": name, "marker": marker}
+
+
+def _match_trace(stage: Stage, which: np.ndarray, name: str, colour: str) -> Plot:
+    """Build a 3-D trace of some of the matches, as lines with gaps."""
+    chosen = np.flatnonzero(which)[:: max(1, len(which) // _MAX_LINES)]
+    ends: list[list[float | None]] = [[], [], []]
+    for i in chosen:
+        for axis in range(3):
+            start, end = stage.source[i, axis], stage.target[stage.matched[i], axis]
+            ends[axis] += [round(float(start), 3), round(float(end), 3), None]
+    common = {"type": "scatter3d", "mode": "lines", "hoverinfo": "skip", "line": {"color": colour}}
+    return common | {"x": ends[0], "y": ends[1], "z": ends[2], "name": name}
+
+
+def robustness_plot(curves: Mapping[str, dict]) -> Plot:
+    """Plot figure 2 from a curve.json: wrong matches against a wrong rotation vector."""
+    data = []
+    for index, (label, curve) in enumerate(curves["curves"].items()):
+        colour = RED if label == "rotation vector" else f"hsl(210, 60%, {70 - 12 * index}%)"
+        trace = {"x": curves["percent"], "y": curve["mean"], "name": label}
+        data.append(trace | {"line": {"color": colour}})
+    for label, points in curves["paper"].items():
+        marker = {"symbol": "x", "color": RED if label == "rotation vector" else BLUE}
+        trace = {"x": [float(p) for p in points], "y": list(points.values()), "mode": "markers"}
+        data.append(trace | {"name": f"paper's chart, {label}", "marker": marker})
+    layout = {
+        "xaxis": {"title": {"text": "per cent corrupted"}},
+        "yaxis": {"title": {"text": "rotation error, mean, deg"}},
+        "margin": {"t": 20, "r": 10},
+    }
+    return {"data": data, "layout": layout}

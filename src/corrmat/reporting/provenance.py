@@ -1,0 +1,139 @@
+"""Where a record comes from: the commit of the code, and what has changed since."""
+
+import ast
+import functools
+import subprocess
+from collections.abc import Iterable
+from pathlib import Path
+
+import yaml
+
+from corrmat.methods import METHODS
+from corrmat.reporting.record import Record
+
+PACKAGE = Path(__file__).resolve().parents[1]
+# The modules that compute an arm's numbers; what they import belongs to it, up to the boundary.
+_ROOTS = ("corrmat.training.fit", "corrmat.training.recipe", "corrmat.baselines")
+_BOUNDARY = ("corrmat.reporting", "corrmat.training.console", "corrmat.training.loggers")
+_NETWORKS = "corrmat.networks"
+
+
+def commit() -> str | None:
+    """Return the commit of the code, with "+" if files have changed; None outside a checkout."""
+    try:
+        changed = _git(PACKAGE, "status", "--porcelain", "--", ".", "../../configs")
+        head = _git(PACKAGE, "rev-parse", "--short=12", "HEAD")
+    except OSError:
+        return None
+    if head.returncode or changed.returncode or not _is_ours():
+        return None
+    return head.stdout.strip() + ("+" if changed.stdout.strip() else "")
+
+
+def command(record: Record) -> str:
+    """Return the command that makes a record again; a recipe of one's own has no make target."""
+    if not record.paper:
+        return f"corrmat run --config ... --scale {record.scale}"
+    target = record.id if record.id == "outliers" else f"exp{record.id}"
+    scale = "" if record.scale == "laptop" else f" SCALE={record.scale}"
+    data = "" if record.data == "shapes" else f" DATA={record.data} ROOT=..."
+    seed = "" if record.seed == 0 else f' ARGS="--seed {record.seed}"'
+    return f"make {target}{scale}{data}{seed}"
+
+
+def staleness(record: Record, repository: Path) -> str:
+    """Say what has changed since a record's arms were trained; empty if nothing has.
+
+    Comments, docstrings and formatting do not count.
+
+    Args:
+        record: with the commits that its arms were trained at.
+        repository: a checkout that has these commits.
+    """
+    commits = {str(arm.trained_at or record.commit) for arm in record.arms.values()}
+    if any(name == "None" or name.endswith("+") for name in commits):
+        return "trained with uncommitted code"
+    code = [f"src/{path}" for path in code_of(record.family, record.arms)]
+    code += [f"configs/exp/{record.id}.yaml", f"configs/{record.family.lower()}.yaml"]
+    changed: set[str] = set()
+    for name in commits:
+        try:
+            diff = _git(repository, "diff", "--name-only", "--relative", name, "--", *code)
+        except OSError:
+            return "git is not at hand, so nobody can tell whether the code has changed"
+        if diff.returncode:
+            return f"commit {name} is not at hand, so nobody can tell whether the code has changed"
+        for path in diff.stdout.split():
+            then, now = _git(repository, "show", f"{name}:./{path}"), repository / path
+            same = not then.returncode and now.exists()
+            if not (same and _meaning(path, then.stdout) == _meaning(path, now.read_text())):
+                changed.add(now.name)
+    return f"changed since: {', '.join(sorted(changed))}" if changed else ""
+
+
+def code_of(family: str, arms: Iterable[str], package: Path = PACKAGE) -> list[str]:
+    """List the files that a family's numbers depend on, from the import graph of the package.
+
+    Other families' networks do not count.
+
+    Args:
+        family: of the record; the start of its methods' names.
+        arms: names of arms, which may be methods.
+        package: folder of the package.
+
+    Returns:
+        Paths like "corrmat/ops/rigid.py".
+    """
+    methods = [name for name in METHODS if name in arms or name.split("_")[0] == family]
+    networks = {METHODS[name].network_type.__module__ for name in methods or METHODS}
+    pending, reached = {*_ROOTS, *networks}, set[str]()
+    while pending:
+        module = pending.pop()
+        path = _path(module, package)
+        if module in reached or path is None or module.startswith(_BOUNDARY):
+            continue
+        reached.add(module)
+        for name in _imports(path):
+            skip_networks = name.startswith(_NETWORKS) and not module.startswith(_NETWORKS)
+            pending |= set() if skip_networks else {name}
+    paths = (_path(module, package) for module in reached)
+    return sorted(p.relative_to(package.parent).as_posix() for p in paths if p is not None)
+
+
+@functools.cache
+def _imports(path: Path) -> frozenset[str]:
+    """List the modules of the package that a file may import."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("corrmat"):
+            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+        elif isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names if alias.name.startswith("corrmat")}
+    return frozenset(names)
+
+
+def _path(module: str, package: Path) -> Path | None:
+    """Return the file of a module; None for a name that is not a module."""
+    path = package.parent.joinpath(*module.split(".")).with_suffix(".py")
+    return path if path.is_file() else None
+
+
+def _meaning(name: str, text: str) -> object:
+    """Parse a recipe or a module, without comments and docstrings."""
+    if name.endswith(".yaml"):
+        return yaml.safe_load(text)
+    tree = ast.parse(text)
+    for node in ast.walk(tree):
+        documented = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+        if documented and ast.get_docstring(node, clean=False) is not None:
+            del node.body[0]
+    return ast.dump(tree)
+
+
+def _is_ours() -> bool:
+    """Tell whether git tracks this package (and not a folder that it is installed into)."""
+    return not _git(PACKAGE, "ls-files", "--error-unmatch", "__init__.py").returncode
+
+
+def _git(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(["git", *words], cwd=folder, capture_output=True, text=True)

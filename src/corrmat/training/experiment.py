@@ -1,0 +1,225 @@
+"""An experiment: every arm trained, tested once on the frozen pairs, and written as a record."""
+
+import logging
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from corrmat.baselines import BASELINES, UNTRAINED
+from corrmat.data.datamodule import PairDataset
+from corrmat.files import ensure_writable
+from corrmat.losses import CorrespondenceLoss
+from corrmat.metrics import summary
+from corrmat.module import OptimizerSettings, RegistrationModule
+from corrmat.reporting.provenance import commit
+from corrmat.reporting.record import ArmResult, Record, Subset
+from corrmat.reporting.snapshots import PairSnapshot, take_snapshot
+from corrmat.reporting.tables import terminal_table
+from corrmat.reporting.writer import pair_rows, write_record
+from corrmat.training import loggers, runs
+from corrmat.training.console import Board
+from corrmat.training.fit import fresh_method, load_trained, score, train
+from corrmat.training.hardware import is_first_process
+from corrmat.training.preflight import Arm, prepare
+from corrmat.training.recipe import Recipe
+from corrmat.training.runs import TrainedArm
+
+log = logging.getLogger("corrmat")
+Tests = list[dict[str, Tensor]]
+"""Per-pair values of a test, one set a rotation band."""
+
+
+def run(
+    recipe: Recipe,
+    results: Path,
+    runs_folder: Path,
+    logger: loggers.Choice = "csv",
+    *,
+    fresh: bool = False,
+) -> Record | None:
+    """Train and test every arm, and write the record when all are done.
+
+    Args:
+        recipe: the experiment.
+        results: folder of records; this one goes to <scale>/<data>/<id>.
+        runs_folder: folder of checkpoints and logs, the same below it.
+        logger: see `loggers.make_loggers`.
+        fresh: start anew where a run was interrupted or an arm is trained already.
+
+    Returns:
+        The record; None in the further processes of a distributed run.
+    """
+    for folder in (results, runs_folder):
+        ensure_writable(folder / recipe.place)
+    arms = [prepare(settings) for settings in recipe.arms.values()]
+    digest = _check_test_pairs(recipe, arms[0])
+    trained: dict[str, TrainedArm] = {}
+    arm_results: dict[str, ArmResult] = {}
+    baseline_results: dict[str, ArmResult] = {}
+    rows: list[dict[str, object]] = []
+    snapshots: list[PairSnapshot] = []
+    with Board() as board:
+        for arm in arms:
+            log.info(f"\n{recipe.id} {arm.name} ({recipe.scale}, {recipe.data})")
+            trained[arm.name] = train_or_reuse(recipe, arm, runs_folder, logger, board, fresh=fresh)
+            if not is_first_process():  # further processes only train
+                continue
+            method = load_trained(arm, trained[arm.name].checkpoint)
+            tests, arm_results[arm.name] = _test(method, arm, recipe, trained[arm.name])
+            rows += pair_rows(arm.name, tests)
+            if arm.name == recipe.treatment:
+                snapshots = _snapshots(method, arm, tests, recipe)
+    if not is_first_process():
+        return None
+    for name in recipe.baselines:
+        tests, baseline_results[name] = _test(_baseline(name, arms[-1]), arms[-1], recipe)
+        rows += pair_rows(name, tests)
+    record = Record(
+        id=recipe.id,
+        title=recipe.title,
+        scale=recipe.scale,
+        data=recipe.data,
+        family=recipe.family,
+        baseline=recipe.baseline,
+        treatment=recipe.treatment,
+        controls=list(recipe.controls),
+        seed=arms[0].settings.seed,
+        commit=commit(),
+        hardware=_merge_hardware([arm.hardware for arm in trained.values()]),
+        versions={name: version(name) for name in ("corrmat", "torch", "lightning", "numpy")},
+        test_pairs=digest,
+        bands_deg=list(recipe.bands_deg),
+        arms=arm_results,
+        baselines=baseline_results,
+        paper=recipe.paper,
+    )
+    write_record(results / recipe.place, record, _config(recipe), rows, snapshots)
+    for arm in arms:
+        runs.mark_recorded(runs_folder / recipe.place / arm.name)
+    loggers.log_record(
+        logger, runs_folder / recipe.place, record, snapshots, results / recipe.place
+    )
+    print(terminal_table(record), flush=True)
+    log.info(f"record: {results / recipe.place}")
+    return record
+
+
+def train_or_reuse(
+    recipe: Recipe,
+    arm: Arm,
+    runs_folder: Path,
+    logger: loggers.Choice,
+    board: Board | None = None,
+    *,
+    fresh: bool = False,
+) -> TrainedArm:
+    """Train an arm of an experiment, unless it is trained already."""
+    trained = None if fresh else runs.find_trained(recipe, arm, runs_folder)
+    if trained is not None:
+        return trained
+    folder = runs_folder / recipe.place / arm.name
+    return train(arm, folder, recipe.place.as_posix(), logger, board, fresh=fresh)
+
+
+def bands(edges_deg: Sequence[float]) -> list[dict[str, float]]:
+    """Return how the test pairs of each rotation band differ from those of training.
+
+    Between two edges the angles lie, and there is no translation (tables 1 and 2 of the paper).
+    Without edges there is one set of pairs, as in training.
+    """
+    return [
+        {"min_rotation_deg": low, "rotation_deg": high, "translation": 0.0}
+        for low, high in zip(edges_deg, edges_deg[1:], strict=False)
+    ] or [{}]
+
+
+def _check_test_pairs(recipe: Recipe, arm: Arm) -> str:
+    """Compute the digest of the test pairs, and warn if the recipe expects another."""
+    digest = arm.datamodule.test_pairs_digest(bands(recipe.bands_deg))
+    if recipe.test_pairs in (None, digest):
+        return digest
+    message = "the test pairs made here (%s) are not the recipe's (%s): numbers compare with other "
+    message += "records in the mean only"
+    log.warning(message, digest, recipe.test_pairs)
+    return digest
+
+
+def _test(
+    module: RegistrationModule, arm: Arm, recipe: Recipe, trained: TrainedArm | None = None
+) -> tuple[Tests, ArmResult]:
+    """Test a module on everything that a recipe asks for.
+
+    Returns:
+        Per-pair values, one set a rotation band; and the result for the record.
+    """
+    tests = score(module, arm, bands(recipe.bands_deg))
+    shares = recipe.sweep_outliers
+    sweep = score(module, arm, [{"outliers": share} for share in shares]) if shares else []
+    together = {key: torch.cat([values[key] for values in tests]) for key in tests[0]}
+    edges = recipe.bands_deg
+    band_results = [
+        Subset(summary(values), band_deg=(low, high))
+        for low, high, values in zip(edges, edges[1:], tests, strict=False)
+    ]
+    sweep_results = [
+        Subset(summary(values), outliers=share) for share, values in zip(shares, sweep, strict=True)
+    ]
+    result = ArmResult(summary(together), band_results, sweep_results)
+    if trained is not None:
+        result = ArmResult(
+            result.metrics, result.bands, result.sweep, trained.pairs_seen,
+            round(trained.train_seconds, 1), trained.commit, trained.curve,
+        )  # fmt: skip
+    return tests, result
+
+
+@torch.no_grad()
+def _snapshots(
+    module: RegistrationModule, arm: Arm, tests: Tests, recipe: Recipe
+) -> list[PairSnapshot]:
+    """Take snapshots of the easiest, median and hardest pair of a METHOD_corr."""
+    if not isinstance(module, CorrespondenceLoss):
+        return []
+    module.cpu().eval()
+    per_band = len(tests[0]["shape"])
+    errors = torch.cat([values["rotation_error_deg"] for values in tests])
+    order = errors.argsort().tolist()
+    snapshots = []
+    for rank, position in (("easiest", 0), ("median", len(order) // 2), ("hardest", -1)):
+        band, index = divmod(order[position], per_band)
+        dataset = arm.datamodule.test_dataloader(**bands(recipe.bands_deg)[band]).dataset
+        assert isinstance(dataset, PairDataset)
+        pair = dataset[(0, index)]
+        prediction = module(pair.source, pair.target)
+        error = float(errors[order[position]])
+        snapshots.append(take_snapshot(arm.name, rank, error, pair, prediction))
+    return snapshots
+
+
+def _baseline(name: str, arm: Arm) -> RegistrationModule:
+    """Build a baseline; "untrained" is the arm's own network before training."""
+    if name == UNTRAINED:
+        return fresh_method(arm.settings)
+    return RegistrationModule(BASELINES[name](), OptimizerSettings())
+
+
+def _merge_hardware(arms: Sequence[Mapping[str, object]]) -> dict[str, object]:
+    """Describe what all arms were trained on; "a / b" where they differ."""
+    merged: dict[str, object] = {}
+    for key in arms[0]:
+        values = list(dict.fromkeys(arm.get(key) for arm in arms))
+        merged[key] = values[0] if len(values) == 1 else " / ".join(map(str, values))
+    return merged
+
+
+def _config(recipe: Recipe) -> dict[str, object]:
+    """Return every setting of every arm, for config.yaml; the data's folder stays private."""
+    arms = {name: settings.as_plain() for name, settings in recipe.arms.items()}
+    for settings in arms.values():
+        data = settings["data"]
+        assert isinstance(data, dict)
+        data.pop("root")
+    return {"id": recipe.id, "scale": recipe.scale, "arms": arms}

@@ -1,0 +1,175 @@
+"""Train one arm with Lightning, and score it on the frozen test pairs."""
+
+import logging
+import shutil
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import lightning as L
+import torch
+from lightning.pytorch.callbacks import ModelCheckpoint
+from torch import Tensor
+
+from corrmat.errors import CorrmatError
+from corrmat.methods import Method
+from corrmat.module import RegistrationModule
+from corrmat.reporting.provenance import commit
+from corrmat.training import loggers, runs
+from corrmat.training.callbacks import PerPairCollector, SaveOnInterrupt, ValidationHistory
+from corrmat.training.console import Board, BoardProgress
+from corrmat.training.hardware import (
+    describe_hardware,
+    first_device,
+    is_first_process,
+    keep_freed_memory,
+    trainer_options,
+)
+from corrmat.training.preflight import Arm, build_method
+from corrmat.training.recipe import ArmSettings
+from corrmat.training.runs import TrainedArm
+
+log = logging.getLogger("corrmat")
+MONITOR = "val/rotation_error_deg_mean"  # the best checkpoint has the lowest
+
+
+def train(
+    arm: Arm,
+    folder: Path,
+    group: str = "",
+    logger: loggers.Choice = "csv",
+    board: Board | None = None,
+    *,
+    fresh: bool = False,
+) -> TrainedArm:
+    """Train one arm; an interrupted run of the same settings continues.
+
+    Args:
+        arm: from `prepare`.
+        folder: for checkpoints (best.ckpt on validation, last.ckpt) and logs.
+        group: wandb's name for the arms that belong together.
+        logger: see `loggers.make_loggers`.
+        board: to show progress on.
+        fresh: start anew in any case.
+
+    Raises:
+        CorrmatError: a loss that is not finite; a full disk.
+        KeyboardInterrupt: Ctrl-C in the last step; the arm is trained.
+    """
+    method = fresh_method(arm.settings)
+    resume_from = None if fresh else runs.find_interrupted(folder, arm)
+    if resume_from is None:
+        size = sum(p.numel() for p in method.parameters())
+        log.info(f"{size:,} parameters, {len(arm.datamodule.clouds('train'))} training shapes")
+    if is_first_process():
+        if resume_from is None:
+            shutil.rmtree(folder, ignore_errors=True)
+        runs.start_run(folder, arm)
+    else:
+        logger, board = "none", None
+
+    history, interrupt = ValidationHistory(), SaveOnInterrupt(folder / "last.ckpt")
+    callbacks = [
+        history,
+        ModelCheckpoint(folder, "best", monitor=MONITOR, enable_version_counter=False),
+        ModelCheckpoint(folder, "last", enable_version_counter=False),
+        interrupt,
+        *([BoardProgress(board, arm.name, history)] if board else []),
+    ]
+    lightning_loggers = loggers.make_loggers(
+        logger, folder, arm.name, group, arm.settings.as_plain()
+    )
+    keep_freed_memory()
+    trainer = L.Trainer(
+        **trainer_options(arm.settings),  # pyright: ignore[reportArgumentType]
+        logger=lightning_loggers,
+        callbacks=callbacks,
+        default_root_dir=folder,
+    )
+    if resume_from is not None:
+        log.info(f"continuing from {resume_from}")
+    try:
+        trainer.fit(method, arm.datamodule, ckpt_path=resume_from, weights_only=True)
+    except (CorrmatError, OSError) as error:
+        last = folder / "last.ckpt"
+        kept = last if last.is_file() else "none yet"
+        raise CorrmatError(
+            f"{error}; seed {arm.settings.seed}; last good checkpoint: {kept}"
+        ) from error
+    loggers.finish_loggers(lightning_loggers)
+    best = folder / "best.ckpt"
+    if not best.is_file():
+        log.info("training ended before the first validation: the last weights count as the best")
+        trainer.save_checkpoint(best)
+    trained = TrainedArm(
+        best, history.pairs_seen, history.seconds, commit(), history.points,
+        describe_hardware(arm.settings),
+    )  # fmt: skip
+    if is_first_process():
+        runs.finish_run(folder, trained)
+    if interrupt.stop_requested:
+        raise KeyboardInterrupt
+    return trained
+
+
+def fresh_method(settings: ArmSettings) -> Method:
+    """Build the method with the weights that its seed gives: where training starts."""
+    L.seed_everything(settings.seed, workers=True, verbose=False)
+    return build_method(settings)
+
+
+def load_trained(arm: Arm, checkpoint: Path) -> Method:
+    """Build an arm's method with the weights of a checkpoint.
+
+    Raises:
+        CorrmatError: the checkpoint is missing, unreadable, or of another network.
+    """
+    method = build_method(arm.settings)
+    if not checkpoint.is_file():
+        raise CorrmatError(f"no checkpoint {checkpoint}; train first (corrmat fit)")
+    try:
+        state = torch.load(checkpoint, map_location="cpu", weights_only=True)["state_dict"]
+        method.load_state_dict(state)
+    except Exception as error:  # unpickling raises errors of every type
+        reason = str(error).splitlines()[0]
+        raise CorrmatError(f"{checkpoint} does not fit these settings: {reason}") from error
+    return method
+
+
+def score(
+    module: RegistrationModule, arm: Arm, changes: Sequence[Mapping[str, float]] = ({},)
+) -> list[dict[str, Tensor]]:
+    """Score a module on an arm's frozen test pairs, in float32 on one device.
+
+    Args:
+        module: that predicts.
+        arm: whose pairs.
+        changes: fields of `PairSettings` to replace, one set of pairs each.
+
+    Returns:
+        Per-pair values of each set, see `RegistrationMetrics.per_pair`, with the category.
+    """
+    options = trainer_options(arm.settings, "32-true")
+    options |= {
+        "devices": first_device(arm.settings.trainer.devices), "num_nodes": 1, "strategy": "auto",
+        "logger": False, "enable_checkpointing": False, "enable_progress_bar": False,
+    }  # fmt: skip
+    collector = PerPairCollector()
+    trainer = L.Trainer(**options, callbacks=[collector])  # pyright: ignore[reportArgumentType]
+    tests = []
+    for fields in changes:
+        trainer.test(module, arm.datamodule.test_dataloader(**fields), verbose=False)
+        labels = torch.from_numpy(arm.datamodule.clouds("test").labels)
+        tests.append(collector.per_pair | {"category": labels[collector.per_pair["shape"]]})
+    return tests
+
+
+def silence_libraries() -> None:
+    """Keep Lightning's hints and the deprecations inside libraries off the user's screen."""
+    for message in (
+        "isinstance.treespec, LeafSpec",
+        "Checkpoint directory",  # ours holds the logs already
+        "resuming from a checkpoint that ended before the epoch",  # the DataModule's state helps
+        "does not have many workers",
+    ):
+        warnings.filterwarnings("ignore", message=f".*{message}")

@@ -1,0 +1,139 @@
+"""Preflight checks: what would fail late in a run fails before it starts."""
+
+from dataclasses import dataclass
+
+import lightning as L
+import torch
+from lightning.fabric.utilities.exceptions import MisconfigurationException
+
+from corrmat.data.datamodule import PairDataset, RegistrationDataModule
+from corrmat.errors import CorrmatError
+from corrmat.methods import METHODS, Method
+from corrmat.training.hardware import count_devices, trainer_options
+from corrmat.training.recipe import ArmSettings
+
+
+@dataclass
+class Arm:
+    """An arm that can be trained: its settings are checked and its shapes are open."""
+
+    name: str
+    settings: ArmSettings
+    datamodule: RegistrationDataModule
+
+
+def prepare(settings: ArmSettings) -> Arm:
+    """Build everything that settings configure, before a run deletes or writes anything.
+
+    Raises:
+        CorrmatError: data that cannot be read, a network or Trainer that cannot be built.
+        Exception: whatever a network or loss raises on its first pair; it is not reworded.
+    """
+    if not 0 <= settings.seed < 2**32:
+        raise CorrmatError(f"seed {settings.seed} is not between 0 and 2^32")
+    method = build_method(settings)
+    datamodule = RegistrationDataModule(**settings.data.as_dict(), seed=settings.seed)
+    arm = Arm(settings.name, settings, datamodule)
+    required, points = getattr(method.network, "min_points", 1), datamodule.pairs.num_source
+    if points < required:
+        raise CorrmatError(
+            f"a source of {points} points is too small for {settings.method}, which needs "
+            f"{required}; raise --data.num_points or lower --network.k"
+        )
+    datamodule.setup()
+    _check_optimization(settings)
+    _check_validation(arm)
+    _try_one_batch(method, arm)
+    try:
+        L.Trainer(**trainer_options(settings), logger=False)  # pyright: ignore[reportArgumentType]
+    except (MisconfigurationException, ValueError, TypeError) as error:
+        reason = str(error).splitlines()[0]
+        raise CorrmatError(
+            f"cannot build a Trainer from the --trainer options: {reason}"
+        ) from error
+    return arm
+
+
+def build_method(settings: ArmSettings) -> Method:
+    """Build the method of these settings, freshly initialised.
+
+    Raises:
+        CorrmatError: the network or loss cannot be built with these options.
+    """
+    network, loss = settings.network.as_dict(), settings.loss.as_dict()
+    try:
+        return METHODS[settings.method](network, loss, settings.optimizer)
+    except (ValueError, RuntimeError, ArithmeticError) as error:
+        raise CorrmatError(
+            f"cannot build {settings.method} from the --network options: {error}"
+        ) from error
+
+
+def _check_optimization(settings: ArmSettings) -> None:
+    """Reject optimizer settings that Lightning would only fail on after training has started."""
+    trainer, optimizer = settings.trainer, settings.optimizer
+    if trainer.accumulate_grad_batches < 1:
+        raise CorrmatError(
+            f"--trainer.accumulate_grad_batches {trainer.accumulate_grad_batches} is not positive"
+        )
+    for name in ("max_steps", "max_epochs", "limit_train_batches", "limit_test_batches"):
+        if getattr(trainer, name) == 0:
+            raise CorrmatError(f"--trainer.{name} 0 leaves nothing to do")
+    timed = trainer.max_time is not None and trainer.max_epochs is None
+    endless = trainer.max_steps == -1 and (trainer.max_epochs == -1 or timed)
+    if optimizer.schedule == "onecycle":
+        if endless:
+            raise CorrmatError("a one-cycle learning rate needs --trainer.max_steps or max_epochs")
+        if trainer.max_steps * optimizer.warmup == 1:  # torch divides by the steps after the first
+            raise CorrmatError(
+                f"a one-cycle learning rate cannot rise in one step, {optimizer.warmup:g} of "
+                f"--trainer.max_steps {trainer.max_steps}: change either"
+            )
+    if trainer.gradient_clip_val and str(trainer.precision) == "16-mixed":
+        raise CorrmatError(
+            f"--trainer.precision {trainer.precision} cannot clip gradients: take bf16-mixed, or "
+            "--trainer.gradient_clip_val null"
+        )
+
+
+def _check_validation(arm: Arm) -> None:
+    """Reject validation that never comes, or that would save checkpoints within a step."""
+    trainer, data = arm.settings.trainer, arm.datamodule
+    processes = count_devices(trainer.devices) * trainer.num_nodes
+    held_out = len(data.clouds("val"))
+    if processes > held_out:
+        raise CorrmatError(
+            f"{processes} processes cannot share {held_out} held-out shapes: lower "
+            "--trainer.devices, or raise --data.train_shapes"
+        )
+    accumulate, interval = trainer.accumulate_grad_batches, trainer.val_check_interval
+    batches = len(data.train_dataloader())
+    if trainer.check_val_every_n_epoch is not None and isinstance(interval, int | float):
+        least = interval if isinstance(interval, int) else 1 / interval
+        if least > batches:
+            raise CorrmatError(
+                f"--trainer.val_check_interval {interval} never comes in epochs of {batches} "
+                "batches; --trainer.check_val_every_n_epoch null counts over epochs"
+            )
+    if accumulate == 1 or interval is None or (isinstance(interval, float) and interval == 1):
+        return  # validation follows whole steps, or whole epochs
+    boundaries = [interval]
+    if trainer.check_val_every_n_epoch is None:  # batches are counted over epochs
+        boundaries.append(batches)
+    if any(number % accumulate for number in boundaries):
+        raise CorrmatError(
+            f"with --trainer.accumulate_grad_batches {accumulate}, validation after {interval} "
+            "batches would write checkpoints in the middle of a step: choose a number that divides "
+            + " and ".join(f"{number:g}" for number in boundaries)
+        )
+
+
+@torch.no_grad()
+def _try_one_batch(method: Method, arm: Arm) -> None:
+    """Run one batch through network and loss, as in training and as in a test."""
+    dataset = arm.datamodule.test_dataloader().dataset
+    assert isinstance(dataset, PairDataset)
+    batch = dataset.__getitems__([(0, 0)] * 2)
+    for training in (True, False):
+        method.train(training)
+        method.loss(method(batch.source, batch.target), batch)

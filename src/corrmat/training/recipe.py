@@ -1,0 +1,365 @@
+"""A recipe is YAML: what an experiment claims, and the settings of its arms at every scale.
+
+Its layers lie over each other: the family's file (`base`), its scale, the experiment's file, its
+scale, the arm's own lines, the command line. The result is checked against the types of the
+classes that it configures, so a misspelt key is an error and nothing starts.
+"""
+
+import inspect
+import typing
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal, cast
+
+import lightning as L
+import yaml
+from jsonargparse import ArgumentParser, Namespace
+
+from corrmat.baselines import BASELINES, UNTRAINED
+from corrmat.data.datamodule import RegistrationDataModule, data_name
+from corrmat.errors import CorrmatError
+from corrmat.methods import METHODS
+from corrmat.module import OptimizerSettings
+from corrmat.reporting.record import ArmResult
+
+SCALES = ("smoke", "laptop", "paper")
+GROUPS = ("data", "network", "loss", "optimizer", "trainer")
+Precision = Literal["auto", "32-true", "64-true", "bf16-mixed", "bf16-true", "16-mixed"]
+Settings = dict[str, object]
+"""Nested settings as YAML has them."""
+
+_KEYS = {
+    "id", "title", "family", "baseline", "treatment", "controls", "paper", "arms", "scales",
+    "bands_deg", "sweep_outliers", "networks_of", "baselines", "test_pairs", "base", "seed",
+    *GROUPS,
+}  # fmt: skip
+_NOT_TRAINER: set[str | int] = {  # set by this project
+    "enable_checkpointing", "enable_model_summary", "logger", "callbacks", "default_root_dir",
+    "plugins", "profiler", "model_registry", "use_distributed_sampler", "precision",
+}  # fmt: skip
+# Options of the data that do not change its test pairs.
+_NOT_TEST_PAIRS = {"data", "root", "name", "batch_size", "num_workers", "train_shapes", "stretch"}
+
+
+@dataclass(frozen=True)
+class ArmSettings:
+    """Every setting of an arm, with the types of the classes that it configures."""
+
+    name: str
+    method: str
+    seed: int
+    data: Namespace  # of RegistrationDataModule
+    network: Namespace  # of the method's network
+    loss: Namespace  # of the method's LossSettings
+    optimizer: OptimizerSettings
+    trainer: Namespace  # of Lightning's Trainer; `precision` may be "auto"
+
+    @property
+    def data_name(self) -> str:
+        """What the data set is called in results/."""
+        return data_name(self.data.data, self.data.root, self.data.name)
+
+    def as_plain(self) -> Settings:
+        """Return the settings as dictionaries, lists, numbers and text, as YAML has them."""
+        groups = {name: getattr(self, name) for name in GROUPS}
+        groups["optimizer"] = asdict(self.optimizer)
+        return cast(Settings, _plain({"method": self.method, "seed": self.seed, **groups}))
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """One experiment at one scale."""
+
+    id: str
+    title: str
+    scale: str
+    family: str  # DCP, RPMNet, PCRNet, or the name of a network of one's own
+    baseline: str | None  # the arm METHOD
+    treatment: str  # the arm METHOD_corr
+    controls: tuple[str, ...]  # further arms
+    paper: dict[str, ArmResult]  # what the paper reports, by arm
+    arms: dict[str, ArmSettings]
+    bands_deg: tuple[float, ...]  # edges of rotation bands to test on one by one; may be empty
+    sweep_outliers: tuple[float, ...]  # shares of outliers to test on as well; may be empty
+    networks_of: str | None  # the experiment whose trained networks serve here too
+    baselines: tuple[str, ...]  # predictors to test that need no training
+    test_pairs: str | None  # expected digest of the frozen test pairs, if there is one
+
+    @property
+    def data(self) -> str:
+        """What the data set is called in results/."""
+        return next(iter(self.arms.values())).data_name
+
+    @property
+    def place(self) -> Path:
+        """Folder of the record below results/, and of the runs below runs/."""
+        return Path(self.scale, self.data, self.id)
+
+
+def load(
+    path: Path,
+    scale: str,
+    overrides: Mapping[str, object] | None = None,
+    arms: Sequence[str] | None = None,
+) -> Recipe:
+    """Read a recipe and put overrides over it.
+
+    Args:
+        path: the experiment's YAML file.
+        scale: one of `SCALES`.
+        overrides: nested settings, e.g. {"data": {"num_points": 256}}.
+        arms: only these arms.
+
+    Raises:
+        CorrmatError: the file, a key, a value or an override is not valid.
+    """
+    merged = _merge_layers(path, scale)
+    _check_keys(merged, path)
+    all_arms = cast(dict[str, Settings | None], merged["arms"])
+    for arm in arms or ():
+        if arm not in all_arms:
+            raise CorrmatError(f"{path}: unknown arm {arm!r}; arms: {', '.join(all_arms)}")
+    common = {key: merged[key] for key in ("seed", *GROUPS) if key in merged}
+    settings = {
+        arm: _arm_settings(arm, common, dict(all_arms[arm] or {}), overrides or {}, path)
+        for arm in arms or all_arms
+    }
+    return Recipe(
+        id=str(merged["id"]),
+        title=str(merged["title"]),
+        scale=scale,
+        paper={
+            arm: ArmResult.from_json(values)
+            for arm, values in cast(dict[str, Settings], merged.get("paper") or {}).items()
+        },
+        arms=settings,
+        bands_deg=tuple(cast(list[float], merged.get("bands_deg") or ())),
+        sweep_outliers=tuple(cast(list[float], merged.get("sweep_outliers") or ())),
+        networks_of=str(merged["networks_of"]) if "networks_of" in merged else None,
+        baselines=_check_baselines(cast(list[str], merged.get("baselines") or []), path),
+        test_pairs=_expected_digest(merged, scale, settings, overrides or {}),
+        **_roles(merged, all_arms, settings, path),  # pyright: ignore[reportArgumentType]
+    )
+
+
+def add_settings(parser: ArgumentParser, methods: Sequence[str] = tuple(METHODS)) -> None:
+    """Add the typed settings of arms as options: --seed, --data.*, --network.* and so on.
+
+    Args:
+        parser: to add to.
+        methods: the options of these methods' networks and losses.
+    """
+    classes = [METHODS[name] for name in methods]
+    parser.add_argument("--seed", type=int, default=0, help="of weights, pairs and held-out shapes")
+    parser.add_class_arguments(RegistrationDataModule, "data", skip={"seed"})
+    _add_union(parser, "network", [method.network_type for method in classes])
+    _add_union(parser, "loss", [method.LossSettings for method in classes])
+    parser.add_class_arguments(OptimizerSettings, "optimizer")
+    parser.add_class_arguments(L.Trainer, "trainer", skip=_NOT_TRAINER, instantiate=False)
+    parser.add_argument(
+        "--trainer.precision", type=Precision, default="auto",
+        help="auto: bfloat16 products where the machine computes them fast, else float32",
+    )  # fmt: skip
+
+
+def parse_overrides(options: Sequence[str]) -> Settings:
+    """Parse options like ["--data.keep", "0.7"] to nested overrides for `load`.
+
+    Raises:
+        CorrmatError: an option is unknown, or a value has another type.
+    """
+    parser = ArgumentParser(prog="corrmat", exit_on_error=False)
+    add_settings(parser)
+    try:
+        return parser.parse_args(list(options), defaults=False).as_dict()
+    except Exception as error:  # jsonargparse raises errors of several types
+        raise CorrmatError(first_line(error)) from error
+
+
+def merge(under: Mapping[str, object], over: Mapping[str, object]) -> Settings:
+    """Merge dictionaries key by key; other values are replaced."""
+    merged = dict(under)
+    for key, value in over.items():
+        below = merged.get(key)
+        if isinstance(value, Mapping) and isinstance(below, Mapping):
+            merged[key] = merge(below, value)
+        else:
+            merged[key] = value
+    return merged
+
+
+def first_line(error: Exception) -> str:
+    """Return the first two lines of an error of jsonargparse as one line."""
+    lines = [line.strip(" -") for line in str(error).splitlines() if line.strip(" -")]
+    return " ".join(lines[:2])
+
+
+def _add_union(parser: ArgumentParser, group: str, classes: Sequence[type]) -> None:
+    """Add the parameters of several classes as one group; the first class that has one wins."""
+    first, *others = sorted(set(classes), key=lambda c: (-len(_parameters(c)), c.__name__))
+    added = set(_parameters(first))
+    parser.add_class_arguments(first, group, instantiate=False)
+    for other in others:
+        hints = typing.get_type_hints(other.__init__)
+        for name, parameter in _parameters(other).items():
+            if name not in added:
+                parser.add_argument(
+                    f"--{group}.{name}", type=hints[name], default=parameter.default,
+                    help=f"see {other.__name__}",
+                )  # fmt: skip
+                added.add(name)
+
+
+def _parameters(cls: type) -> dict[str, inspect.Parameter]:
+    parameters = inspect.signature(cls).parameters
+    return {name: p for name, p in parameters.items() if p.kind is p.POSITIONAL_OR_KEYWORD}
+
+
+def _merge_layers(path: Path, scale: str) -> Settings:
+    """Read a recipe and its base, and lay their scales over them."""
+    experiment = _read(path)
+    base = _read(path.parent / str(experiment["base"])) if "base" in experiment else {}
+    merged: Settings = {}
+    for layer in (base, _at_scale(base, scale), experiment, _at_scale(experiment, scale)):
+        merged = merge(merged, layer)
+    return merged
+
+
+def _check_keys(merged: Settings, path: Path) -> None:
+    """Check the keys of a merged recipe and the types of those that are not settings."""
+    unknown = sorted(set(merged) - _KEYS)
+    if unknown:
+        raise CorrmatError(f"{path}: unknown key {unknown[0]!r}; keys: {', '.join(sorted(_KEYS))}")
+    for key in ("id", "title", "arms"):
+        if key not in merged:
+            raise CorrmatError(f"{path} lacks {key!r}")
+    arms = merged["arms"]
+    if not isinstance(arms, dict) or not all(_is_mapping(own) for own in arms.values()):
+        raise CorrmatError(f"{path}: arms must be names with settings, e.g. arms: {{DCP: {{}}}}")
+    for key in ("bands_deg", "sweep_outliers", "baselines", "controls"):
+        if not isinstance(merged.get(key) or [], list):
+            raise CorrmatError(f"{path}: {key} must be a list, e.g. {key}: [...]")
+
+
+def _roles(
+    merged: Settings, arms: Mapping[str, object], chosen: Mapping[str, object], path: Path
+) -> Settings:
+    """Read which of the chosen arms is METHOD, which METHOD_corr, and which are controls.
+
+    A recipe of one arm need not say it.
+    """
+    treatment = merged.get("treatment") or (next(iter(arms)) if len(arms) == 1 else None)
+    baseline = merged.get("baseline")
+    controls = tuple(cast(list[str], merged.get("controls") or ()))
+    if treatment is None:
+        raise CorrmatError(f"{path} lacks 'treatment': the arm that the experiment is about")
+    named = [arm for arm in (baseline, treatment, *controls) if arm is not None]
+    if sorted(map(str, named)) != sorted(arms):
+        raise CorrmatError(
+            f"{path}: baseline, treatment and controls name {', '.join(map(str, named))}; "
+            f"the arms are {', '.join(arms)}"
+        )
+    return {
+        "family": str(merged.get("family") or treatment),
+        "baseline": baseline if baseline in chosen else None,
+        "treatment": treatment if treatment in chosen else next(iter(chosen)),
+        "controls": tuple(arm for arm in controls if arm in chosen),
+    }
+
+
+def _arm_settings(
+    arm: str,
+    common: Mapping[str, object],
+    own: Settings,
+    overrides: Mapping[str, object],
+    path: Path,
+) -> ArmSettings:
+    """Check the settings of an arm against the types of what they configure."""
+    method = str(own.pop("method", arm))
+    if method not in METHODS:
+        raise CorrmatError(f"{path}: unknown method {method!r}; methods: {', '.join(METHODS)}")
+    settings = merge(common, own)
+    trainer = overrides.get("trainer")
+    if isinstance(trainer, Mapping) and "max_epochs" in trainer:
+        # Whoever names a number of epochs means it: the recipe's steps no longer count.
+        settings = merge(settings, {"trainer": {"max_steps": -1}})
+    parser = ArgumentParser(prog="corrmat", exit_on_error=False)
+    add_settings(parser, [method])
+    try:
+        parser.parse_object(settings)
+    except Exception as error:  # jsonargparse raises errors of several types
+        raise CorrmatError(f"{path}: {first_line(error)}") from error
+    try:
+        parsed = parser.parse_object(merge(settings, overrides))
+    except Exception as error:
+        raise CorrmatError(f"{first_line(error)} (corrmat fit --help lists the options)") from error
+    return ArmSettings(
+        arm, method, parsed.seed, parsed.data, parsed.network,
+        parsed.get("loss") or Namespace(), OptimizerSettings(**parsed.optimizer.as_dict()),
+        parsed.trainer,
+    )  # fmt: skip
+
+
+def _check_baselines(names: Sequence[str], path: Path) -> tuple[str, ...]:
+    available = (*BASELINES, UNTRAINED)
+    for name in names:
+        if name not in available:
+            raise CorrmatError(
+                f"{path}: unknown baseline {name!r}; baselines: {', '.join(available)}"
+            )
+    return tuple(names)
+
+
+def _expected_digest(
+    merged: Settings,
+    scale: str,
+    arms: Mapping[str, ArmSettings],
+    overrides: Mapping[str, object],
+) -> str | None:
+    """Return the recipe's digest, unless an override asks for other test pairs."""
+    changed = set(cast(Mapping[str, object], overrides.get("data") or {})) - _NOT_TEST_PAIRS
+    if changed or "seed" in overrides:
+        return None
+    by_scale = cast(Mapping[str, Mapping[str, str]], merged.get("test_pairs") or {})
+    data = next(iter(arms.values())).data.data
+    return (by_scale.get(scale) or {}).get(data)
+
+
+def _at_scale(recipe: Settings, scale: str) -> Settings:
+    """Return the part of a recipe for a scale."""
+    scales = recipe.get("scales") or {}
+    if not isinstance(scales, dict) or not all(_is_mapping(part) for part in scales.values()):
+        raise CorrmatError("scales must be names with settings, e.g. scales: {laptop: {}}")
+    for name in scales:
+        if name not in SCALES:
+            raise CorrmatError(f"unknown scale {name!r}; scales: {', '.join(SCALES)}")
+    return scales.get(scale) or {}
+
+
+def _is_mapping(value: object) -> bool:
+    return value is None or isinstance(value, dict)
+
+
+def _read(path: Path) -> Settings:
+    """Read a YAML file that holds a dictionary."""
+    if not path.is_file():
+        raise CorrmatError(f"no recipe {path}; see configs/exp/")
+    try:
+        content = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        raise CorrmatError(f"{path} is not YAML: {first_line(error)}") from error
+    if not isinstance(content, dict):
+        raise CorrmatError(f"{path} holds no settings")
+    return content
+
+
+def _plain(value: object) -> object:
+    """Convert nested settings to dictionaries, lists, numbers and text."""
+    if isinstance(value, Namespace):
+        value = value.as_dict()
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value if isinstance(value, str | int | float | bool | None) else str(value)

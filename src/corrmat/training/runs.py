@@ -1,0 +1,116 @@
+"""The ledger under runs/: which arm is trained with which settings, and where to continue."""
+
+import json
+import logging
+import pickle
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import cast
+
+import torch
+import yaml
+
+from corrmat.files import replace_text
+from corrmat.training.preflight import Arm
+from corrmat.training.recipe import Recipe, Settings
+
+log = logging.getLogger("corrmat")
+_TRAINED = "trained.json"
+_SETTINGS = "settings.yaml"
+_RECORDED = "recorded"  # marks an arm whose record is written: the next run trains anew
+
+
+@dataclass
+class TrainedArm:
+    """An arm after training."""
+
+    checkpoint: Path  # the best weights on validation
+    pairs_seen: int
+    train_seconds: float
+    commit: str | None
+    curve: list[dict[str, float]] = field(default_factory=list)
+    hardware: dict[str, object] = field(default_factory=dict)
+
+
+def arm_folders(recipe: Recipe, arm: str, runs: Path) -> list[Path]:
+    """List the folders of an arm: of this experiment, and of the one named by `networks_of`."""
+    identities = filter(None, (recipe.id, recipe.networks_of))
+    return [runs / recipe.scale / recipe.data / identity / arm for identity in identities]
+
+
+def training_settings(arm: Arm) -> str:
+    """Return what decides how an arm is trained, as YAML: settings and a checksum of the shapes.
+
+    The data's folder, the number of workers and the number of test shapes do not count.
+    """
+    settings = arm.settings.as_plain()
+    data = cast(Settings, settings["data"])
+    for name in ("root", "name", "num_workers", "test_shapes"):
+        del data[name]
+    data["checksum"] = arm.datamodule.clouds("train").checksum()
+    return yaml.safe_dump(settings, sort_keys=False)
+
+
+def start_run(folder: Path, arm: Arm) -> None:
+    """Create a run's folder and write its settings."""
+    folder.mkdir(parents=True, exist_ok=True)
+    replace_text(folder / _SETTINGS, training_settings(arm))
+
+
+def finish_run(folder: Path, trained: TrainedArm) -> None:
+    """Note that an arm is trained."""
+    content = asdict(trained) | {"checkpoint": trained.checkpoint.name}
+    replace_text(folder / _TRAINED, json.dumps(content, indent=1))
+
+
+def mark_recorded(folder: Path) -> None:
+    """Note that the record of an arm is written."""
+    if folder.is_dir():
+        (folder / _RECORDED).touch()
+
+
+def find_trained(recipe: Recipe, arm: Arm, runs: Path) -> TrainedArm | None:
+    """Find the same arm, trained to the end with the same settings before.
+
+    Either this experiment trained it and has not written its record yet, or the experiment did
+    that `networks_of` names.
+    """
+    own, *others = arm_folders(recipe, arm.name, runs)
+    for folder in (*([] if (own / _RECORDED).exists() else [own]), *others):
+        if (folder / _TRAINED).is_file() and _same_settings(folder, arm):
+            log.info(f"trained already: {folder}")
+            content = json.loads((folder / _TRAINED).read_text())
+            return TrainedArm(**content | {"checkpoint": folder / content["checkpoint"]})
+    return None
+
+
+def find_interrupted(folder: Path, arm: Arm) -> Path | None:
+    """Find the checkpoint of an interrupted run of the same settings.
+
+    It is the last one, or the best one if the last was cut short.
+    """
+    if (folder / _TRAINED).is_file() or not _same_settings(folder, arm):
+        return None
+    for checkpoint in (folder / "last.ckpt", folder / "best.ckpt"):
+        if checkpoint.is_file():
+            try:
+                torch.load(checkpoint, map_location="cpu", weights_only=True, mmap=True)
+            except (RuntimeError, OSError, ValueError, EOFError, pickle.UnpicklingError):
+                log.info(f"{checkpoint} cannot be read and is left out")
+            else:
+                return checkpoint
+    return None
+
+
+def best_checkpoint(recipe: Recipe, arm: Arm, runs: Path) -> Path:
+    """Find the best weights of an arm: its own, or the same arm's of `networks_of`."""
+    own, *others = arm_folders(recipe, arm.name, runs)
+    for folder in (own, *others):
+        if (folder / "best.ckpt").is_file() and (folder == own or _same_settings(folder, arm)):
+            return folder / "best.ckpt"
+    return own / "best.ckpt"
+
+
+def _same_settings(folder: Path, arm: Arm) -> bool:
+    stored = folder / _SETTINGS
+    return stored.is_file() and stored.read_text() == training_settings(arm)

@@ -1,0 +1,78 @@
+"""Models against each other on the same frozen pairs."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from corrmat.cli import main
+from corrmat.data import registry
+from corrmat.errors import CorrmatError
+from corrmat.registration import benchmark
+from corrmat.reporting import documents
+
+
+@pytest.fixture
+def pairs(monkeypatch):
+    from corrmat.data.shapes import dataset as shapes
+
+    few = shapes.load("test", 6)
+    monkeypatch.setitem(registry.DATASETS, "shapes", lambda split, count, root: few)
+    return benchmark.frozen_pairs("clean", points=256, count=4)
+
+
+def test_pairs_are_frozen_and_spread_over_the_split(pairs):
+    again = benchmark.frozen_pairs("clean", points=256, count=4)
+    assert torch.equal(pairs.source, again.source)
+    assert pairs.shape.tolist() == [0, 2, 3, 5]
+    assert pairs.source.shape == (4, 256, 6)
+    real = benchmark.frozen_pairs("real", points=256, count=4)
+    assert real.source.shape == real.target.shape == (4, 179, 6)
+
+
+def test_who_knows_the_truth_scores_everything_and_who_does_not_nothing(pairs, monkeypatch):
+    def answer(source, target, model, refine):
+        index = next(i for i, c in enumerate(pairs.source) if np.allclose(c.numpy(), source))
+        transform = np.eye(4)
+        transform[:3, :3] = pairs.rotation[index]
+        transform[:3, 3] = pairs.translation[index]
+        if model == "wrong":
+            transform[:3, 3] += 0.5
+            transform[:3, :3] = transform[:3, :3] @ np.diag([1.0, -1, -1])
+        found = type("Found", (), {})()
+        found.transform, found.seconds, found.agreement, found.support = transform, 0.01, 1.0, 1.0
+        return found
+
+    monkeypatch.setattr(benchmark, "register", answer)
+    found = benchmark.compare(pairs, ["right", "wrong"])
+    assert found["right"].recall_5deg == found["right"].recall_adds == 1
+    assert found["right"].mean_deg < 0.05
+    assert found["wrong"].recall_5deg == found["wrong"].recall_adds == 0
+    assert found["wrong"].mean_deg == pytest.approx(180, abs=0.1)
+    assert found["right"].ms == pytest.approx(10)
+
+
+def test_the_command_prints_one_table_and_writes_a_record(pairs, tmp_path, capsys):
+    path = tmp_path / "results" / "register" / "clean-shapes-256.json"
+    words = ["compare", "icp,corrmat", "--protocol", "clean", "--points", "256"]
+    assert main([*words, "--pairs", "4", "--record", str(path)]) == 0
+    shown = capsys.readouterr().out
+    for word in ("4 pairs", "recall at 5°", "recall ADD-S", "ms a pair", "icp", "corrmat"):
+        assert word in shown
+    record = json.loads(path.read_text())
+    assert record["pairs"] == 4
+    assert len(record["models"]["icp"]["per_pair"]["rotation_error_deg"]) == 4
+    assert record["models"]["corrmat"]["recall_5deg"] >= record["models"]["icp"]["recall_5deg"]
+    table = documents.register_table(tmp_path / "results")
+    assert table.splitlines()[0] == "| pairs | data | points | icp | corrmat |"
+    assert table.splitlines()[2].startswith("| clean | shapes | 256 | ")
+
+
+def test_what_cannot_be_compared_is_said(pairs):
+    with pytest.raises(CorrmatError, match="points = 2000"):
+        benchmark.frozen_pairs("real", points=2000)
+    assert benchmark.frozen_pairs("paper", points=1500, count=1).target.shape[1] == 1500
+    with pytest.raises(CorrmatError, match="needs its folder"):
+        benchmark.frozen_pairs("real", data="modelnet40")
+    assert main(["compare", "nobody", "--points", "64", "--pairs", "1"]) == 2
