@@ -16,6 +16,7 @@ import multiprocessing
 import resource
 import statistics
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -32,12 +33,11 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 
 import twins  # noqa: E402  # pyright: ignore[reportMissingImports]
-from corrmat.aligners import CLASSICAL  # noqa: E402
-from corrmat.experiment import keep_freed_memory, make_module, prepare  # noqa: E402
-from corrmat.recipe import load as load_recipe  # noqa: E402
 
-from corrmat.data import shapes  # noqa: E402
+from corrmat.data.clouds import finish_shards, open_shards, write_shard  # noqa: E402
+from corrmat.data.datamodule import EpochSampler, PairDataset  # noqa: E402
 from corrmat.data.pairs import Key, PairSettings, make_pairs  # noqa: E402
+from corrmat.data.shapes import dataset  # noqa: E402
 from corrmat.errors import CorrmatError  # noqa: E402
 from corrmat.losses import chamfer_loss, correspondence_loss  # noqa: E402
 from corrmat.methods import METHODS  # noqa: E402
@@ -47,6 +47,11 @@ from corrmat.ops import streaming  # noqa: E402
 from corrmat.ops.correspondence import SinkhornCorrespondence, SoftCorrespondence  # noqa: E402
 from corrmat.ops.neighbors import within_radius  # noqa: E402
 from corrmat.ops.rigid import procrustes  # noqa: E402
+from corrmat.registration.hypotheses import CLASSICAL  # noqa: E402
+from corrmat.training.fit import fresh_method  # noqa: E402
+from corrmat.training.hardware import keep_freed_memory  # noqa: E402
+from corrmat.training.preflight import prepare  # noqa: E402
+from corrmat.training.recipe import load as load_recipe  # noqa: E402
 from corrmat.types import PairBatch  # noqa: E402
 
 Row = dict[str, Any]
@@ -80,6 +85,7 @@ def main() -> None:
     peak = in_a_process(matmul_peak)["gflops"]
     add("matrix product 2048^3, float32", {"gflops": peak})
     add("pairs, N=512, one core", in_a_process(pairs_a_second))
+    add("pairs, N=512, of 100,000 made-up shapes", in_a_process(pairs_of_many_shapes))
     for method, hparams, n, batch in STEPS:
         size = "laptop network" if hparams else "paper's network"
         what = method, hparams, n, batch
@@ -107,14 +113,14 @@ def main() -> None:
             row = in_a_process(grown, what, n)
             growth[what].append({"n": n, **row})
             add(f"{what}, one pair, N={n}", row)
-    exponents = {what: fitted(found) for what, found in growth.items()}
-    for what, found in exponents.items():
-        print(f"{what}: time ~ N^{found['seconds']}, memory ~ N^{found['peak_mb']}")
+    exponents = {what: fitted(measured) for what, measured in growth.items()}
+    for what, exponent in exponents.items():
+        print(f"{what}: time ~ N^{exponent['seconds']}, memory ~ N^{exponent['peak_mb']}")
     recipes: dict[str, dict[str, float]] = {}
     for path in sorted((ROOT / "configs" / "exp").glob("*.yaml")):
-        recipe = load_recipe(path, "laptop", [])
+        recipe = load_recipe(path, "laptop")
         if recipe.networks_of is None:
-            arms = {arm: in_a_process(minutes_of, path, arm) for arm in recipe.settings}
+            arms = {arm: in_a_process(minutes_of, path, arm) for arm in recipe.arms}
             recipes[recipe.id] = arms
             print(f"minutes of {recipe.id} at laptop scale: {arms}", flush=True)
     place = ROOT / "results" / "bench"
@@ -124,8 +130,8 @@ def main() -> None:
         "instructions": torch.backends.cpu.get_cpu_capability(),
         "torch": torch.__version__,
     }
-    found = {**about, "rows": rows, "growth": growth, "exponents": exponents, "recipes": recipes}
-    (place / "bench.json").write_text(json.dumps(found, indent=1) + "\n")
+    content = {**about, "rows": rows, "growth": growth, "exponents": exponents, "recipes": recipes}
+    (place / "bench.json").write_text(json.dumps(content, indent=1) + "\n")
     draw(growth, exponents, place / "growth.png")
     print(f"written: {place.relative_to(ROOT)}/bench.json, growth.png")
 
@@ -134,9 +140,9 @@ def minutes_of(path: Path, arm: str) -> float:
     """Minutes that training an arm of a recipe takes, by its steps and validation batches."""
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     keep_freed_memory()
-    settings = load_recipe(path, "laptop", [], [arm]).settings[arm]
-    ready = prepare(arm, settings)
-    module, trainer = make_module(settings), settings.trainer
+    settings = load_recipe(path, "laptop", arms=[arm]).arms[arm]
+    ready = prepare(settings)
+    module, trainer = fresh_method(settings), settings.trainer
     train, held_out = ready.datamodule.train_dataloader(), ready.datamodule.val_dataloader()
     adam = torch.optim.Adam(module.parameters(), 1e-4, fused=True)
     pairs, checked = iter(train), iter(held_out)
@@ -167,10 +173,38 @@ def matmul_peak() -> Row:
 def pairs_a_second() -> Row:
     """Pairs a second on one core, identical sampling, N = 512."""
     torch.set_num_threads(1)
-    clouds, how = shapes.load("test", 32), PairSettings(num_points=512)
+    clouds, settings = dataset.load("test", 32), PairSettings(num_points=512)
     keys = [Key(0, 0, 0, i) for i in range(16)]
-    seconds = median([lambda: make_pairs(clouds, range(16), keys, how)], 100)[0]
+    seconds = median([lambda: make_pairs(clouds, range(16), keys, settings)], 100)[0]
     return {"pairs_a_second": round(16 / seconds), "ms_a_pair": round(1e3 * seconds / 16, 3)}
+
+
+def pairs_of_many_shapes() -> Row:
+    """Pairs a second from 100,000 made-up shapes on disk, beside 4,000, and the process' memory.
+
+    Shards hold one shape many times: what is measured is reading, not the shapes. The memory is
+    the whole process', libraries included.
+    """
+    torch.set_num_threads(1)
+    with tempfile.TemporaryDirectory() as folder:
+        works = [_pairs_of(Path(folder, str(count)), count) for count in (100_000, 4_000)]
+        many, few = median(works, 100)
+    return {
+        "pairs_a_second": round(16 / many),
+        "ratio_to_4000_shapes": round(few / many, 2),
+        "process_mb": round(peak_mb()),
+    }
+
+
+def _pairs_of(folder: Path, count: int) -> Callable[[], object]:
+    """Write a data set of so many shapes; return what draws sixteen random pairs of it."""
+    rows = dataset.load("test", 1).rows[np.arange(1)].repeat(1000, 0)
+    for number in range(count // 1000):
+        write_shard(folder, number, rows, np.zeros(1000, np.int64), [])
+    finish_shards(folder, ["made-up"], count // 1000)
+    pairs = PairDataset(open_shards(folder), PairSettings(num_points=512), 0, "train")
+    sampler = iter(EpochSampler(len(pairs), seed=0, shuffle=True))
+    return lambda: pairs.__getitems__([next(sampler) for _ in range(16)])
 
 
 def training_step(method: str, hparams: dict[str, Any], n: int, batch: int) -> Row:
@@ -200,8 +234,8 @@ def against_released(method: str, hparams: dict[str, Any], n: int, batch: int) -
     """How many times longer a step in the released formulation takes."""
     pairs, module, step = build(method, hparams, n, batch)
     both = [lambda way=way: step(way(module, pairs)) for way in (loss_of, released_loss)]
-    own, other = median(both, 1 if n * batch > 2000 else 9)
-    return {"released_ratio": round(other / own, 2)}
+    ours, other = median(both, 1 if n * batch > 2000 else 9)
+    return {"released_ratio": round(other / ours, 2)}
 
 
 def against_compiled(method: str, hparams: dict[str, Any], n: int, batch: int) -> Row:
@@ -216,25 +250,25 @@ def against_compiled(method: str, hparams: dict[str, Any], n: int, batch: int) -
         step(module.loss(network(pairs.source, pairs.target), pairs))
 
     (first,) = median([compiled], 1, warm=False)
-    own, eager = median([compiled, lambda: step(loss_of(module, pairs))], 9)
+    ours, eager = median([compiled, lambda: step(loss_of(module, pairs))], 9)
     return {
-        "ms_a_pair": round(1e3 * own / batch, 1),
-        "eager_ratio": round(eager / own, 2),
+        "ms_a_pair": round(1e3 * ours / batch, 1),
+        "eager_ratio": round(eager / ours, 2),
         "first_step_s": round(first),
     }
 
 
 @torch.no_grad()
 def inference(method: str) -> Row:
-    """Milliseconds from one pair to its motion; the released formulation where there is a twin."""
+    """Milliseconds from one pair to its transform; also as released, where there is a twin."""
     pairs, module, _ = build(method, {}, 1024, 1)
     module.eval()
     both: list[Callable[[], object]] = [lambda: module(pairs.source, pairs.target)]
     if twin := RELEASED.get(type(module.network)):
         both.append(lambda: twin(module.network, pairs.source, pairs.target))
-    own, *other = median(both, 5)
-    return {"ms": round(1e3 * own, 1)} | (
-        {"released_ratio": round(other[0] / own, 2)} if other else {}
+    ours, *other = median(both, 5)
+    return {"ms": round(1e3 * ours, 1)} | (
+        {"released_ratio": round(other[0] / ours, 2)} if other else {}
     )
 
 
@@ -252,17 +286,17 @@ def against_twin(name: str) -> Row:
     """How many times longer an operation's naive twin takes."""
     torch.manual_seed(0)
     fast, naive = TWINS[name]()
-    own, other = median([fast, naive], 5)
-    return {"ms": round(1e3 * own, 1), "naive_ratio": round(other / own, 2)}
+    ours, other = median([fast, naive], 5)
+    return {"ms": round(1e3 * ours, 1), "naive_ratio": round(other / ours, 2)}
 
 
 def _pulled(work: Callable[..., Any], *inputs: torch.Tensor) -> Callable[[], None]:
     leaves = [t.clone().requires_grad_() for t in inputs]
 
     def run() -> None:
-        found = work(*leaves)
-        found = found if isinstance(found, tuple) else (found,)
-        torch.cat([t.flatten() for t in found]).sum().backward()
+        outputs = work(*leaves)
+        outputs = outputs if isinstance(outputs, tuple) else (outputs,)
+        torch.cat([t.flatten() for t in outputs]).sum().backward()
 
     return run
 
@@ -325,8 +359,8 @@ def against_dense(n: int) -> Row:
         streaming._DENSE = most  # entries up to which the matrix is made whole
         step()
 
-    own, other = median([lambda: on(0), lambda: on(n * n)], 3)
-    return {"ms": round(1e3 * own, 1), "dense_ratio": round(other / own, 2)}
+    ours, other = median([lambda: on(0), lambda: on(n * n)], 3)
+    return {"ms": round(1e3 * ours, 1), "dense_ratio": round(other / ours, 2)}
 
 
 def grown(what: str, n: int) -> Row:
@@ -359,12 +393,12 @@ def _loss_and_pose(n: int) -> Callable[[], None]:
     return step
 
 
-def fitted(found: list[Row]) -> dict[str, float | None]:
+def fitted(measured: list[Row]) -> dict[str, float | None]:
     """Exponents of time from N = 1024 on, of memory from 4096: there the matrix is streamed."""
     exponents: dict[str, float | None] = {}
     for name, least in (("seconds", 1024), ("peak_mb", 4096)):
-        known = [(row["n"], row[name]) for row in found if row[name] > 0 and row["n"] >= least]
-        slope = np.polyfit(*np.log(known).T, 1)[0] if len(known) > 1 else None
+        points = [(row["n"], row[name]) for row in measured if row[name] > 0 and row["n"] >= least]
+        slope = np.polyfit(*np.log(points).T, 1)[0] if len(points) > 1 else None
         exponents[name] = None if slope is None else round(float(slope), 2)
     return exponents
 
@@ -376,9 +410,11 @@ def draw(growth: dict[str, list[Row]], exponents: dict[str, Any], path: Path) ->
     for axes, name, title in zip(
         panels, ("seconds", "peak_mb"), ("seconds a pair", "peak memory, MB"), strict=True
     ):
-        for what, found in growth.items():
-            known = [(row["n"], row[name]) for row in found if row[name] > 0]
-            axes.loglog(*zip(*known, strict=True), "o-", label=f"{what}: N^{exponents[what][name]}")
+        for what, measured in growth.items():
+            points = [(row["n"], row[name]) for row in measured if row[name] > 0]
+            axes.loglog(
+                *zip(*points, strict=True), "o-", label=f"{what}: N^{exponents[what][name]}"
+            )
         axes.set(xlabel="points N of either cloud", title=title)
         axes.set_xticks(POINTS, [str(n) for n in POINTS], minor=False)
         axes.tick_params(axis="x", which="minor", bottom=False, labelbottom=False)
@@ -394,11 +430,11 @@ def build(
     """Pairs of N points (of an ellipsoid if N is large), a method, a step of its optimizer."""
     torch.manual_seed(0)
     keep_freed_memory()
-    module: Any = METHODS[method](METHODS[method].network_type(**hparams))
-    if n <= shapes.load("test", 1).points.shape[1]:
+    module: Any = METHODS[method](hparams)
+    if n <= dataset.load("test", 1).num_points:
         keys = [Key(0, 0, 0, i) for i in range(batch)]
-        how = PairSettings(num_points=n)
-        pairs = make_pairs(shapes.load("test", batch), range(batch), keys, how)
+        settings = PairSettings(num_points=n)
+        pairs = make_pairs(dataset.load("test", batch), range(batch), keys, settings)
     else:
         cloud = torch.nn.functional.normalize(torch.randn(batch, n, 3), dim=-1)
         rows = torch.cat([cloud * torch.tensor([1.0, 0.7, 0.4]), cloud], -1)
@@ -428,8 +464,8 @@ RELEASED: dict[type, Callable[..., tuple[Any, ...]]] = {
 
 def released_loss(module: Any, pairs: PairBatch) -> torch.Tensor:  # noqa: ANN401
     """The same of the same weights, in the released formulation."""
-    *_, found = RELEASED[type(module.network)](module.network, pairs.source, pairs.target)
-    matrices = found if isinstance(found, list | tuple) else [found]
+    *_, last = RELEASED[type(module.network)](module.network, pairs.source, pairs.target)
+    matrices = last if isinstance(last, list | tuple) else [last]
     return torch.stack([twins.one_hot_loss(c, pairs.match) for c in matrices]).sum()
 
 

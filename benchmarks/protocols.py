@@ -20,10 +20,10 @@ def run(root: Path | None) -> None:
             for points in (512, 1024):
                 name = f"{protocol}-{data}-{points}"
                 print(f"\n{name}")
-                words = ["--protocol", protocol, "--data", data, "--points", str(points)]
+                words = [MODELS, "--protocol", protocol, "--data", data, "--points", str(points)]
                 words += ["--root", str(root)] if data == "modelnet40" else []
                 path = RESULTS / f"{name}.json"
-                code = main(["evaluate", "--models", MODELS, *words, "--record", str(path)])
+                code = main(["compare", *words, "--record", str(path)])
                 if code:
                     sys.exit(code)
 
