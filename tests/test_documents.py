@@ -11,9 +11,9 @@ from conftest import ROOT
 from sybil import Sybil
 from sybil.parsers.markdown import PythonCodeBlockParser
 
-from corrmat.cli import parse
 from corrmat.data.shapes import dataset
 from corrmat.networks.dcp import DCPNetwork
+from corrmat.options import parse
 from corrmat.weights import load_reference
 
 PAGES = ["README.md", *sorted(str(p.relative_to(ROOT)) for p in (ROOT / "docs").glob("*.md"))]

@@ -1,0 +1,262 @@
+"""The options of every command: one parser, its help, and what it accepts."""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+from jsonargparse import ArgumentParser, Namespace
+
+from corrmat.errors import CorrmatError
+
+EPILOG = """examples:
+  corrmat register source.ply target.ply -o aligned.ply --html view.html
+      align two clouds of your own (corrmat example DIR writes two to try)
+  corrmat run --config configs/exp/1.1.yaml
+      both arms at laptop scale, our numbers beside the paper's
+  corrmat run --config configs/exp/1.2.yaml --scale smoke
+      the same in seconds, to see that everything works
+  corrmat fit --config configs/exp/1.1.yaml --arm DCP_corr --trainer.max_steps 200
+      one arm, with any setting changed
+  corrmat evaluate --config configs/exp/1.1.yaml --arm DCP_corr
+      the best checkpoint of the last run (or --checkpoint FILE) on the frozen test pairs
+  corrmat compare corrmat,ransac,fgr,icp --protocol real
+      the shipped weights beside the classical pipelines, on the same frozen pairs
+  corrmat robustness
+      figure 2 of the paper: curve and picture in results/laptop/robustness
+  corrmat data --sheet shapes.png
+      make the embedded data set, draw its families
+
+  eval "$(corrmat completion bash)"
+      complete commands, options and files with the tab key (also zsh, tcsh)
+
+Every setting of a recipe is an option, too: --data.*, --network.*, --loss.*, --optimizer.*,
+--trainer.* (Lightning's own Trainer) and --seed. corrmat fit --help lists them with their types.
+
+exit codes: 0 done; 1 interrupted (the same command continues from its checkpoint);
+2 the input cannot be used, and one line says why."""
+
+RUN_EPILOG = """examples:
+  corrmat run --config configs/exp/1.2.yaml
+  corrmat run --config configs/exp/1.2.yaml --scale smoke --logger none -q
+  corrmat run --config configs/exp/1.1.yaml --data.data modelnet40 --data.root /data
+  corrmat run --config configs/exp/1.1.yaml --data.data folder --data.root meshes"""
+
+FIT_EPILOG = """examples:
+  corrmat fit --config configs/exp/1.1.yaml
+  corrmat fit --config configs/exp/2.2.yaml --arm RPMNet --trainer.max_steps 500
+  corrmat fit --config configs/exp/outliers.yaml --arm DCP_corr --network.outlier dustbin
+Ctrl-C saves a checkpoint; the same command continues from it."""
+
+EVALUATE_EPILOG = """examples:
+  corrmat evaluate --config configs/exp/1.1.yaml
+  corrmat evaluate --config configs/exp/1.1.yaml --checkpoint best.ckpt --data.rotation_deg 45"""
+
+COMPARE_EPILOG = """examples:
+  corrmat compare corrmat,ransac,fgr,icp --protocol real
+  corrmat compare corrmat,dcp_v1.t7 --data modelnet40 --root /data --points 1024
+
+protocols: real: disjoint samples, noise, both clouds cropped and with outliers, normals
+estimated; clean: the same without crop and outliers; paper: experiment 1.2's pairs."""
+
+REGISTER_EPILOG = """examples:
+  corrmat register scan1.ply scan2.ply
+      print the 4 x 4 matrix that takes scan1 onto scan2, and how far to trust it
+  corrmat register part.stl scan.pcd -o aligned.ply --json T.json --html view.html
+      write the moved source, the result for programs, and a page to look at
+  corrmat register a.npy b.npy --model ransac
+      the classical pipeline instead (pip install open3d)
+
+Files: PLY, OBJ, STL, OFF, GLB, GLTF (meshes are sampled, scenes merged), PCD, XYZ, TXT, CSV,
+NPY, NPZ. Both files must have the same unit, whichever it is. Parts may be missing from either.
+
+exit codes: 0 done, whatever the verdict; 2 a file cannot be used, and one line says why."""
+
+Scale = Literal["smoke", "laptop", "paper"]
+EXPERIMENT_COMMANDS = ("run", "fit", "evaluate")
+
+
+def parse(words: Sequence[str]) -> Namespace:
+    """Parse a command line.
+
+    Returns:
+        The command's options with the command's name as `command`. Settings of a recipe are not
+        among them: those that were given are in `overrides`, nested.
+
+    Raises:
+        CorrmatError: an option is unknown or missing, or a value is not valid.
+    """
+    command = words[0] if words and words[0] in EXPERIMENT_COMMANDS else None
+    parser = build_parser([command] if command else [])
+    try:
+        parsed = parser.parse_args(list(words))
+        given = parser.parse_args(list(words), defaults=False) if command else Namespace()
+    except argparse.ArgumentError as error:
+        lines = [line.strip(" -") for line in str(error).splitlines() if line.strip(" -")]
+        raise CorrmatError(f"{' '.join(lines[:2])}; see corrmat --help") from error
+    options = parsed[parsed.command]
+    options.command = parsed.command
+    if command:
+        from corrmat.training.recipe import GROUPS
+
+        settings = given[parsed.command].as_dict()
+        options.overrides = {k: v for k, v in settings.items() if k in ("seed", *GROUPS)}
+    return options
+
+
+def build_parser(with_settings: Sequence[str] = ()) -> ArgumentParser:
+    """Build the parser of every command.
+
+    Args:
+        with_settings: commands that get the typed settings of recipes, whose import takes seconds.
+    """
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = ArgumentParser(
+        prog="corrmat",
+        description="Correspondence Matrices are Underrated (3DV 2020), reproduced.",
+        epilog=EPILOG,
+        formatter_class=raw,
+        exit_on_error=False,
+    )
+    commands = parser.add_subcommands(dest="command", metavar="command")
+
+    def add(name: str, purpose: str, epilog: str = "", usage: str | None = None) -> ArgumentParser:
+        command = ArgumentParser(
+            prog=f"corrmat {name}", description=purpose, epilog=epilog, formatter_class=raw,
+            exit_on_error=False, usage=usage,
+        )  # fmt: skip
+        commands.add_subcommand(name, command, help=purpose)
+        return command
+
+    _add_experiment_options(
+        add("run", "train and test every arm, write a record, print it beside the paper's",
+            RUN_EPILOG, "corrmat run --config FILE [options]"), "run", with_settings,
+    )  # fmt: skip
+    _add_experiment_options(
+        add("fit", "train one arm", FIT_EPILOG, "corrmat fit --config FILE [options]"),
+        "fit", with_settings,
+    )  # fmt: skip
+    _add_experiment_options(
+        add("evaluate", "test the checkpoint of one arm", EVALUATE_EPILOG,
+            "corrmat evaluate --config FILE [options]"), "evaluate", with_settings,
+    )  # fmt: skip
+    _add_compare_options(add("compare", "compare models on the same frozen pairs", COMPARE_EPILOG))
+    _add_register_options(add("register", "align two clouds of your own", REGISTER_EPILOG))
+    example = add("example", "write two scans to try register on")
+    example.add_argument("folder", type=Path, help="for source.ply, target.ply and truth.json")
+    robustness = add("robustness", "figure 2: wrong matches against a wrong rotation vector")
+    robustness.add_argument(
+        "--scale", type=Scale, default="laptop",
+        help="smoke: 20 draws a point of a curve instead of 400",
+    )  # fmt: skip
+    robustness.add_argument("--results", type=Path, default=Path("results"), help="of records")
+    robustness.add_argument("--seed", type=_count, default=0, help="of the draws")
+    data = add(
+        "data", "make the embedded data set, or fetch ModelNet40",
+        "examples:\n  corrmat data --sheet a.png\n  corrmat data modelnet40 --root /data",
+    )  # fmt: skip
+    data.add_argument("name", nargs="?", type=Literal["shapes", "modelnet40"], default="shapes")
+    data.add_argument("--root", type=Path, help="modelnet40: folder to fetch it into")
+    data.add_argument(
+        "--mirror", action="append", metavar="URL",
+        help="modelnet40: address of its zip; may be given more than once",
+    )  # fmt: skip
+    data.add_argument("--sheet", type=Path, metavar="PNG", help="draw one shape of every family")
+    report = add(
+        "report", "one page, or the documents' tables, from results/",
+        "examples:\n  corrmat report -o report.html\n  corrmat report results/ --docs .",
+    )  # fmt: skip
+    report.add_argument("results", nargs="?", type=Path, default=Path("results"), help="of records")
+    report.add_argument("-o", "--output", type=Path, help="write all records as one HTML page")
+    report.add_argument(
+        "--docs", type=Path, help="folder of README.md and docs/: rewrite tables, redraw pictures"
+    )
+    completion = add("completion", "print a script that completes words in a shell")
+    completion.add_argument("shell", type=Literal["bash", "zsh", "tcsh"])
+    return parser
+
+
+def _add_experiment_options(
+    parser: ArgumentParser, name: str, with_settings: Sequence[str]
+) -> None:
+    """Add the options of run, fit and evaluate."""
+    parser.add_argument("--config", type=Path, help="the experiment, e.g. configs/exp/1.1.yaml")
+    parser.add_argument("--scale", type=Scale, default="laptop", help="of the experiment")
+    parser.add_argument("--runs", type=Path, default=Path("runs"), help="of checkpoints and logs")
+    if name in ("run", "fit"):
+        parser.add_argument(
+            "--logger", type=Literal["none", "csv", "wandb"], default="wandb",
+            help="wandb: CSV and wandb offline; csv; none. The record is written in any case",
+        )  # fmt: skip
+        parser.add_argument(
+            "--fresh", action="store_true",
+            help="train anew, even where a run of the same settings was interrupted or is done",
+        )  # fmt: skip
+        parser.add_argument("-q", "--quiet", action="store_true", help="print results only")
+        parser.add_argument(
+            "-v", "--verbose", action="store_true", help="Lightning's messages, too"
+        )
+    if name == "run":
+        parser.add_argument("--results", type=Path, default=Path("results"), help="of records")
+    else:
+        parser.add_argument("--arm", help="one of the recipe's arms (default: its METHOD_corr)")
+    if name == "evaluate":
+        parser.add_argument(
+            "--checkpoint", type=Path, help="default: best.ckpt of the arm's last fit or run"
+        )
+    if name in with_settings:
+        from corrmat.training.recipe import add_settings
+
+        add_settings(parser)
+
+
+def _add_compare_options(parser: ArgumentParser) -> None:
+    """Add the options of compare."""
+    parser.add_argument("models", help="e.g. corrmat,ransac,fgr,icp or checkpoint files")
+    parser.add_argument(
+        "--protocol", type=Literal["paper", "real", "clean"], default="real", help="see below"
+    )
+    parser.add_argument("--data", default="shapes", help="shapes, modelnet40 or folder")
+    parser.add_argument("--root", type=Path, help="folder of the data set")
+    parser.add_argument(
+        "--points", type=_positive, default=512, help="points of a cloud before it is cropped"
+    )
+    parser.add_argument("--pairs", type=_positive, default=120, help="number of pairs")
+    parser.add_argument(
+        "--record", type=Path, metavar="JSON", help="write the table and the values of each pair"
+    )
+
+
+def _add_register_options(parser: ArgumentParser) -> None:
+    """Add the options of register."""
+    parser.add_argument("source", type=Path, help="the cloud or mesh that is moved")
+    parser.add_argument("target", type=Path, help="the cloud or mesh that it is moved onto")
+    parser.add_argument(
+        "-o", "--output", type=Path, metavar="PLY",
+        help="write the moved source (the points sampled on it, if it is a mesh)",
+    )  # fmt: skip
+    parser.add_argument("--json", type=Path, help="write matrix, confidence and verdict")
+    parser.add_argument("--html", type=Path, help="write a page: before, matches, after")
+    parser.add_argument(
+        "--model", default="corrmat",
+        help="corrmat (the shipped weights), icp, ransac, fgr, or a checkpoint file",
+    )  # fmt: skip
+    parser.add_argument(
+        "--refine", type=Literal["icp", "none"], default="icp", help="refinement after the model"
+    )
+    parser.add_argument("--seed", type=_count, default=0, help="of subsampling and random draws")
+
+
+def _count(text: str) -> int:
+    """Parse a seed or a number of things."""
+    value = int(text)
+    if not 0 <= value < 2**32:
+        raise argparse.ArgumentTypeError(f"{value} is not between 0 and 2^32")
+    return value
+
+
+def _positive(text: str) -> int:
+    value = _count(text)
+    if not value:
+        raise argparse.ArgumentTypeError("must be at least 1")
+    return value
