@@ -154,6 +154,9 @@ def open_shards(folder: Path) -> CloudSet | None:
     """Open a complete folder of shards; None if it is incomplete or damaged.
 
     A damaged shard is deleted, so that only this one has to be made again.
+
+    Raises:
+        CorrmatError: it is complete, but every shape was skipped.
     """
     if not (folder / _INDEX).is_file():
         return None
@@ -170,7 +173,8 @@ def open_shards(folder: Path) -> CloudSet | None:
     filled = [n for n, about in enumerate(index["shards"]) if about["labels"]]
     labels = [label for about in index["shards"] for label in about["labels"]]
     if not filled:
-        raise CorrmatError(f"{folder.name} holds no shapes")
+        first = next(skipped_shapes(folder), "there is none")
+        raise CorrmatError(f"no shape could be read; the first: {first}")
     rows = ShardedRows([_shard(folder, n) for n in filled])
     return CloudSet(rows, np.array(labels, np.int64), tuple(index["names"]))
 

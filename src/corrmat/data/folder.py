@@ -69,11 +69,11 @@ def load(split: str, count: int | None = None, root: Path | None = None) -> Clou
         build_shards(
             shards, names, files, sample_shape, f"sampling {len(files)} {split} shapes (once)"
         )
-        clouds = open_shards(shards)
         skipped = list(skipped_shapes(shards))
-        if skipped:
+        if 0 < len(skipped) < len(files):
             shown = "\n  ".join([*skipped[:_SHOWN], *(["..."] if len(skipped) > _SHOWN else [])])
             log.warning("%d of %d files were skipped:\n  %s", len(skipped), len(files), shown)
+        clouds = open_shards(shards)
     assert clouds is not None
     return clouds.select(slice(count))
 
