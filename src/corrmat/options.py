@@ -121,6 +121,7 @@ def build_parser(with_settings: Sequence[str] = ()) -> ArgumentParser:
     commands = parser.add_subcommands(dest="command", metavar="command")
 
     def add(name: str, purpose: str, epilog: str = "", usage: str | None = None) -> ArgumentParser:
+        """Add a command."""
         command = ArgumentParser(
             prog=f"corrmat {name}", description=purpose, epilog=epilog, formatter_class=raw,
             exit_on_error=False, usage=usage,

@@ -131,6 +131,7 @@ def _identity(files: Sequence[Path], names: Sequence[str]) -> str:
 
 
 def _find_folder(root: Path) -> Path:
+    """Find the official folder: the root, or inside it."""
     for folder in (root, root / FOLDER):
         if (folder / "shape_names.txt").is_file():
             return folder

@@ -92,6 +92,7 @@ def _load_parts(path: Path) -> list[object]:
 
 
 def _merge_meshes(parts: list[object]) -> trimesh.Trimesh | None:
+    """Merge the meshes with an area among the parts of a scene; None if there is none."""
     meshes = [p for p in parts if isinstance(p, trimesh.Trimesh) and len(p.faces) and p.area > 0]
     if not meshes:
         return None
@@ -152,6 +153,7 @@ def _text(path: Path, seed: int) -> np.ndarray:
 
 
 def _is_number(word: str) -> bool:
+    """Tell whether a word is a number."""
     try:
         float(word)
     except ValueError:

@@ -176,6 +176,7 @@ class SinkhornCorrespondence(_LogCorrespondence):
 
     @functools.cached_property
     def _vectors(self) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Write the normalised log matrix as dot products of longer vectors."""
         f_x, f_y = self.feature_source, self.feature_target
         beta, alpha = self.beta[:, None, None], self.alpha[:, None, None]
         # beta (alpha - |f_x|^2 - |f_y|^2 + 2 f_x . f_y) as one dot product.
@@ -214,6 +215,7 @@ class MatchabilityCorrespondence(_LogCorrespondence):
 
     @functools.cached_property
     def _vectors(self) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Add the softmax over columns and the matchabilities, as dot products too."""
         a, b, out = super()._vectors
         assert out is not None
         with torch.autocast(a.device.type, enabled=False):

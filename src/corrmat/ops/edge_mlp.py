@@ -211,6 +211,7 @@ class _LinearReluMax(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, edges: Tensor, weight: Tensor, bias: Tensor, keep: bool, gather: bool):  # noqa: ANN001, ANN205
+        """Compute outputs, maxima and moments slab by slab; save only what backward reads."""
         ctx.set_materialize_grads(False)
         batch, points, k, _ = edges.shape
         size = max(1, _SLAB_ROWS // k)
@@ -250,6 +251,7 @@ class _LinearReluMax(torch.autograd.Function):
         grad_total: Tensor | None,
         grad_second: Tensor | None,
     ):
+        """Compute the gradients of edges, weight and bias; each slab is computed again."""
         edges, weight, out, pooled, argmax = ctx.saved_tensors
         batch, points, k, _ = edges.shape
         size, outputs = max(1, _SLAB_ROWS // k), weight.shape[1]

@@ -115,6 +115,7 @@ class _RotationFromCovariance(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, covariance: Tensor) -> Tensor:  # noqa: ANN001
+        """Compute the optimal rotation by an SVD; NaN where the covariance is not finite."""
         finite = covariance.isfinite().all(-1).all(-1)[..., None, None]
         identity = torch.eye(3, dtype=covariance.dtype, device=covariance.device)
         u, s, vh = torch.linalg.svd(torch.where(finite, covariance, identity))
@@ -126,6 +127,7 @@ class _RotationFromCovariance(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, grad: Tensor) -> Tensor:  # type: ignore[override]  # noqa: ANN001
+        """Solve the 3 x 3 system above in the basis where it is diagonal."""
         rotation, vh, eigenvalue = ctx.saved_tensors
         # In the basis V, G is diagonal and so is tr(G) I - G.
         curvature = eigenvalue.sum(-1, keepdim=True) - eigenvalue

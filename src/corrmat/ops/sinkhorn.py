@@ -64,6 +64,7 @@ class _LogSumExp(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, scores: Tensor, v: Tensor):  # noqa: ANN001, ANN205
+        """Compute the log-sum-exp of every row."""
         shifted = scores - v.unsqueeze(1)
         row_max = shifted.amax(2)
         prob = shifted.sub_(row_max.unsqueeze(2)).clamp_min_(_MIN_EXPONENT).exp_()
@@ -73,6 +74,7 @@ class _LogSumExp(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, grad_total: Tensor):  # type: ignore[override]  # noqa: ANN001, ANN205
+        """Compute the gradients of scores and v from the softmax."""
         scores, v, total = ctx.saved_tensors
         prob = (scores - v.unsqueeze(1)).sub_(total.unsqueeze(2)).clamp_min_(_MIN_EXPONENT).exp_()
         prob.mul_(grad_total.unsqueeze(2))

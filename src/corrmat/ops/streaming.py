@@ -69,6 +69,7 @@ class _SoftmaxRows(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, f_x: Tensor, f_y: Tensor, values: Tensor, last: Tensor | None):  # noqa: ANN001, ANN205
+        """Compute log-sum-exp and mean of every row, slice by slice."""
         total, mean = (
             f_x.new_empty(f_x.shape[:2]),
             values.new_empty(*f_x.shape[:2], values.shape[2]),
@@ -89,6 +90,7 @@ class _SoftmaxRows(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, grad_total: Tensor, grad_mean: Tensor):  # type: ignore[override]  # noqa: ANN001, ANN205
+        """Compute the gradients of features, values and last class, slice by slice."""
         f_x, f_y, values, last, total, mean = ctx.saved_tensors
         # d S_ij = p_ij (g_i + h_i . v_j) with g_i = grad_total_i - h_i . mean_i
         base = grad_total - (grad_mean * mean).sum(2)

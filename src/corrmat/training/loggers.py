@@ -33,10 +33,10 @@ def make_loggers(
         group: <scale>/<data>/<id>, wandb's group.
         config: every setting of the arm.
     """
-    made: list[Logger] = [] if choice == "none" else [CSVLogger(folder, name="csv")]
+    loggers: list[Logger] = [] if choice == "none" else [CSVLogger(folder, name="csv")]
     if choice == "wandb" and _wandb_mode() != "disabled":
-        made.append(WandbLogger(experiment=_start_run(folder, arm, group, config)))
-    return made
+        loggers.append(WandbLogger(experiment=_start_run(folder, arm, group, config)))
+    return loggers
 
 
 def finish_loggers(loggers: Sequence[Logger]) -> None:

@@ -235,7 +235,7 @@ def _check_keys(merged: Settings, path: Path) -> None:
         if key not in merged:
             raise CorrmatError(f"{path} lacks {key!r}")
     arms = merged["arms"]
-    if not isinstance(arms, dict) or not all(_is_mapping(own) for own in arms.values()):
+    if not isinstance(arms, dict) or not all(_is_mapping(settings) for settings in arms.values()):
         raise CorrmatError(f"{path}: arms must be names with settings, e.g. arms: {{DCP: {{}}}}")
     for key in ("bands_deg", "sweep_outliers", "baselines", "controls"):
         if not isinstance(merged.get(key) or [], list):
@@ -271,15 +271,15 @@ def _roles(
 def _arm_settings(
     arm: str,
     common: Mapping[str, object],
-    own: Settings,
+    arm_layer: Settings,
     overrides: Mapping[str, object],
     path: Path,
 ) -> ArmSettings:
     """Check the settings of an arm against the types of what they configure."""
-    method = str(own.pop("method", arm))
+    method = str(arm_layer.pop("method", arm))
     if method not in METHODS:
         raise CorrmatError(f"{path}: unknown method {method!r}; methods: {', '.join(METHODS)}")
-    settings = merge(common, own)
+    settings = merge(common, arm_layer)
     trainer = overrides.get("trainer")
     if isinstance(trainer, Mapping) and "max_epochs" in trainer:
         # Whoever names a number of epochs means it: the recipe's steps no longer count.
@@ -302,6 +302,7 @@ def _arm_settings(
 
 
 def _check_baselines(names: Sequence[str], path: Path) -> tuple[str, ...]:
+    """Check the names of baselines."""
     available = (*BASELINES, UNTRAINED)
     for name in names:
         if name not in available:

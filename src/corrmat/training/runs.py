@@ -75,8 +75,8 @@ def find_trained(recipe: Recipe, arm: Arm, runs: Path) -> TrainedArm | None:
     Either this experiment trained it and has not written its record yet, or the experiment did
     that `networks_of` names.
     """
-    own, *others = arm_folders(recipe, arm.name, runs)
-    for folder in (*([] if (own / _RECORDED).exists() else [own]), *others):
+    main, *others = arm_folders(recipe, arm.name, runs)
+    for folder in (*([] if (main / _RECORDED).exists() else [main]), *others):
         if (folder / _TRAINED).is_file() and _same_settings(folder, arm):
             log.info(f"trained already: {folder}")
             content = json.loads((folder / _TRAINED).read_text())
@@ -104,11 +104,11 @@ def find_interrupted(folder: Path, arm: Arm) -> Path | None:
 
 def best_checkpoint(recipe: Recipe, arm: Arm, runs: Path) -> Path:
     """Find the best weights of an arm: its own, or the same arm's of `networks_of`."""
-    own, *others = arm_folders(recipe, arm.name, runs)
-    for folder in (own, *others):
-        if (folder / "best.ckpt").is_file() and (folder == own or _same_settings(folder, arm)):
+    main, *others = arm_folders(recipe, arm.name, runs)
+    for folder in (main, *others):
+        if (folder / "best.ckpt").is_file() and (folder == main or _same_settings(folder, arm)):
             return folder / "best.ckpt"
-    return own / "best.ckpt"
+    return main / "best.ckpt"
 
 
 def _same_settings(folder: Path, arm: Arm) -> bool:
