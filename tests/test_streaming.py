@@ -1,5 +1,6 @@
 """Rows of a matrix that never exists, against the matrix."""
 
+import os
 import subprocess
 import sys
 
@@ -85,6 +86,13 @@ print((peak() - before) / 1024)
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_memory_is_not_that_of_the_matrix():
-    """8192 x 8192 floats are 256 MB, and the dense way holds several of them at once."""
-    found = subprocess.run([sys.executable, "-c", MEMORY], capture_output=True, text=True)
-    assert 0 < float(found.stdout) < 200, found.stderr
+    """8192 x 8192 floats are 256 MB, and the dense way holds several of them at once.
+
+    Every large block is mapped by itself, so that freed blocks that glibc keeps do not count:
+    with them the same program takes 100 to 225 MB, by chance.
+    """
+    environment = os.environ | {"MALLOC_MMAP_THRESHOLD_": "65536"}
+    result = subprocess.run(
+        [sys.executable, "-c", MEMORY], capture_output=True, text=True, env=environment
+    )
+    assert 0 < float(result.stdout) < 60, result.stderr
