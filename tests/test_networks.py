@@ -5,14 +5,10 @@ import torch
 from twins import (
     attention,
     neighborhood_net,
-    one_hot_loss,
     plain_edge_mlp,
-    released_dcp,
-    released_rpmnet,
     std_norm,
 )
 
-from corrmat.losses import correspondence_loss
 from corrmat.methods import DCP, METHODS, DCPCorr
 from corrmat.networks.attention import Attention, StdNorm, Transformer
 from corrmat.networks.dcp import DCPNetwork
@@ -153,34 +149,6 @@ def test_dcp_shapes_and_finite_gradients(pointer, generator):
         prediction.rotation.sum() + prediction.correspondence.nll(torch.zeros(3, 11).long()).sum()
     ).backward()
     assert all(p.grad is not None and p.grad.isfinite().all() for p in network.parameters())
-
-
-@pytest.mark.parametrize("kind", ["DCP", "RPMNet"])
-def test_networks_equal_the_released_formulation(kind, generator):
-    """Pose, loss and gradients of the code that `make bench` is measured against."""
-    torch.manual_seed(0)
-    network = METHODS[kind].network_type(**TINY[kind]).double().train()
-    target = torch.randn(2, 14, 6, dtype=torch.float64, generator=generator)
-    target[..., 3:] /= target[..., 3:].norm(dim=-1, keepdim=True)
-    source, match = target[:, :12], torch.arange(12).expand(2, -1)
-    found = network(source, target)
-    if kind == "DCP":
-        loss = correspondence_loss(found.correspondence, match)
-        rotation, _, c = released_dcp(network, source, target)
-        released = one_hot_loss(c, match)
-    else:
-        loss = sum(correspondence_loss(step.correspondence, match) for step in found.steps)
-        rotation, _, matrices = released_rpmnet(network, source, target)
-        released = sum(one_hot_loss(c, match) for c in matrices)
-    torch.testing.assert_close(rotation, found.rotation, rtol=1e-6, atol=1e-7)
-    grads = []
-    for value in (loss, released):
-        network.zero_grad()
-        value.backward()
-        grads.append([p.grad.clone() for p in network.parameters() if p.grad is not None])
-    torch.testing.assert_close(released, loss)
-    for ours, theirs in zip(*grads, strict=True):
-        torch.testing.assert_close(theirs, ours, rtol=1e-5, atol=1e-7)
 
 
 def test_dcp_does_not_care_for_the_order_of_points(generator):

@@ -7,7 +7,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from corrmat.networks.attention import StdNorm
 from corrmat.networks.dcp import DCPNetwork
+from corrmat.networks.pcrnet import PCRNetCorrNetwork, PCRNetwork
 from corrmat.networks.ppf import point_pair_features
 from corrmat.networks.rpmnet import RPMNetwork
 
@@ -138,8 +140,12 @@ def released_dcp(network: DCPNetwork, source: Tensor, target: Tensor) -> tuple[T
 
     x, y = source[..., :3], target[..., :3]
     f_x, f_y = embed(x), embed(y)
-    with mock.patch.object(F, "scaled_dot_product_attention", whole_attention):
-        f_x, f_y = f_x + network.pointer(f_x, f_y), f_y + network.pointer(f_y, f_x)
+    with (
+        mock.patch.object(F, "scaled_dot_product_attention", whole_attention),
+        mock.patch.object(StdNorm, "forward", lambda layer, x: std_norm(x, layer.gain, layer.bias)),
+    ):
+        pointer = network.pointer or (lambda features, other: features)
+        f_x, f_y = f_x + pointer(f_x, f_y), f_y + pointer(f_y, f_x)
     c = torch.softmax(f_x @ f_y.mT / math.sqrt(f_x.shape[-1]), -1)
     return *procrustes_loop(x, c @ y, torch.ones_like(c[..., 0])), c
 
@@ -184,3 +190,63 @@ def one_hot_loss(c: Tensor, match: Tensor) -> Tensor:
     """The cross-entropy of matrices (B, N, M) against one-hot matrices."""
     labels = F.one_hot(match, c.shape[2]).to(c.dtype)
     return -(labels * torch.log(c + 1e-30)).sum(2).mean()
+
+
+def pointnet(points: Tensor, network: torch.nn.Module) -> Tensor:
+    """PointNet as 1 x 1 convolutions over (B, 3, N), layer by layer: (B, N, width)."""
+    x = points.mT
+    for layer in network.layers:
+        match layer:
+            case torch.nn.Linear():
+                x = F.conv1d(x, layer.weight.unsqueeze(-1), layer.bias)
+            case torch.nn.BatchNorm1d():
+                x = batch_norm(x, layer)
+            case _:
+                x = x.clamp_min(0)
+    return x.mT
+
+
+def batch_norm(x: Tensor, layer: torch.nn.BatchNorm1d) -> Tensor:
+    """Batch norm of (B, C, ...) by its formula; running statistics are not updated."""
+    over = [0, *range(2, x.dim())]
+    mean = x.mean(over) if layer.training else layer.running_mean
+    var = x.var(over, correction=0) if layer.training else layer.running_var
+    shape = (-1, *[1] * (x.dim() - 2))
+    gain = layer.weight / (var + layer.eps).sqrt()
+    return (x - mean.view(shape)) * gain.view(shape) + layer.bias.view(shape)
+
+
+def released_pcrnet(network: PCRNetwork, source: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """PCRNet in the released formulation: 4 x 4 transforms, one pose after the other."""
+    x, y = source[..., :3], target[..., :3]
+    centre_x, centre_y = x.mean(1), y.mean(1)
+    moved, template = x - centre_x.unsqueeze(1), y - centre_y.unsqueeze(1)
+    f_y = pointnet(template, network.embed).amax(1)
+    total = torch.eye(4).to(x).repeat(len(x), 1, 1)
+    for _ in range(network.iterations):
+        out = torch.cat([f_y, pointnet(moved, network.embed).amax(1)], 1)
+        for layer in network.pose:
+            out = layer(out)
+        rotation = torch.stack([rotation_of_quaternion(q / q.norm()) for q in out[:, :4]])
+        moved = moved @ rotation.mT + out[:, None, 4:]
+        bottom = torch.tensor([0.0, 0, 0, 1]).to(x).expand(len(x), 1, 4)
+        total = torch.cat([torch.cat([rotation, out[:, 4:, None]], 2), bottom], 1) @ total
+    rotation, shift = total[:, :3, :3], total[:, :3, 3]
+    return rotation, shift + centre_y - (rotation @ centre_x.unsqueeze(2)).squeeze(2)
+
+
+def rotation_of_quaternion(q: Tensor) -> Tensor:
+    """R = (w^2 - v.v) I + 2 v v^T + 2 w [v]_x of a unit quaternion (w, v)."""
+    w, v = q[0], q[1:]
+    cross = torch.linalg.cross(v.expand(3, 3), torch.eye(3).to(q)).mT
+    return (w * w - v @ v) * torch.eye(3).to(q) + 2 * torch.outer(v, v) + 2 * w * cross
+
+
+def released_pcrnet_corr(
+    network: PCRNetCorrNetwork, source: Tensor, target: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """PCRNet_corr in the released formulation: convolutions, a whole softmax, an SVD a pair."""
+    x, y = source[..., :3], target[..., :3]
+    f_x, f_y = pointnet(x, network.embed), pointnet(y, network.embed)
+    c = torch.softmax(f_x @ f_y.mT / math.sqrt(f_x.shape[-1]), -1)
+    return *procrustes_loop(x, c @ y, torch.ones_like(c[..., 0])), c
