@@ -164,8 +164,9 @@ def test_a_perfect_prediction_costs_next_to_nothing(generator):
     assert mutual_loss(c, (matches.roll(1, 1), matches)) > 10
 
 
+@pytest.mark.slow
 def test_the_method_learns_eight_pairs_of_two_scans(generator):
-    """Not by heart, but downhill: the loss of a small network falls in 30 steps."""
+    """Halfway; `test_learning.py` has simpler pairs learnt by heart."""
     torch.manual_seed(0)
     how = PairSettings(64, keep=0.7, sampling="disjoint", outliers=0.05, outlier_distance=0.2,
         corrupted="both", normals="estimated")  # fmt: skip
@@ -174,13 +175,13 @@ def test_the_method_learns_eight_pairs_of_two_scans(generator):
     method = InvariantCorr(network, loss={"max_distance": 0.2})
     adam = torch.optim.Adam(method.parameters(), 3e-3)
     losses = []
-    for _ in range(30):
+    for _ in range(100):
         loss = method.loss(method(batch.source, batch.target), batch)
         adam.zero_grad()
         loss.backward()
         adam.step()
         losses.append(float(loss.detach()))
-    assert losses[-1] < 0.95 * losses[0]
+    assert losses[-1] < 0.5 * losses[0]
 
 
 def test_a_network_without_doubt_cannot_be_trained_so(generator):

@@ -120,30 +120,35 @@ def build_parser(with_settings: Sequence[str] = ()) -> ArgumentParser:
     )
     commands = parser.add_subcommands(dest="command", metavar="command")
 
-    def add(name: str, purpose: str, epilog: str = "", usage: str | None = None) -> ArgumentParser:
-        """Add a command."""
+    def add(name: str, purpose: str, epilog: str = "", words: str = "") -> ArgumentParser:
+        """Add a command; `words` are those that its usage names before the options."""
+        usage = " ".join(["corrmat", name, *words.split(), "[options]"])
         command = ArgumentParser(
-            prog=f"corrmat {name}", description=purpose, epilog=epilog, formatter_class=raw,
-            exit_on_error=False, usage=usage,
+            description=purpose, epilog=epilog, formatter_class=raw, exit_on_error=False,
+            usage=usage,
         )  # fmt: skip
         commands.add_subcommand(name, command, help=purpose)
         return command
 
     _add_experiment_options(
         add("run", "train and test every arm, write a record, print it beside the paper's",
-            RUN_EPILOG, "corrmat run --config FILE [options]"), "run", with_settings,
+            RUN_EPILOG, "--config FILE"), "run", with_settings,
     )  # fmt: skip
     _add_experiment_options(
-        add("fit", "train one arm", FIT_EPILOG, "corrmat fit --config FILE [options]"),
+        add("fit", "train one arm", FIT_EPILOG, "--config FILE"),
         "fit", with_settings,
     )  # fmt: skip
     _add_experiment_options(
         add("evaluate", "test the checkpoint of one arm", EVALUATE_EPILOG,
-            "corrmat evaluate --config FILE [options]"), "evaluate", with_settings,
+            "--config FILE"), "evaluate", with_settings,
     )  # fmt: skip
-    _add_compare_options(add("compare", "compare models on the same frozen pairs", COMPARE_EPILOG))
-    _add_register_options(add("register", "align two clouds of your own", REGISTER_EPILOG))
-    example = add("example", "write two scans to try register on")
+    _add_compare_options(
+        add("compare", "compare models on the same frozen pairs", COMPARE_EPILOG, "MODELS")
+    )
+    _add_register_options(
+        add("register", "align two clouds of your own", REGISTER_EPILOG, "SOURCE TARGET")
+    )
+    example = add("example", "write two scans to try register on", words="FOLDER")
     example.add_argument("folder", type=Path, help="for source.ply, target.ply and truth.json")
     robustness = add("robustness", "figure 2: wrong matches against a wrong rotation vector")
     robustness.add_argument(
@@ -172,7 +177,7 @@ def build_parser(with_settings: Sequence[str] = ()) -> ArgumentParser:
     report.add_argument(
         "--docs", type=Path, help="folder of README.md and docs/: rewrite tables, redraw pictures"
     )
-    completion = add("completion", "print a script that completes words in a shell")
+    completion = add("completion", "print a script that completes words in a shell", words="SHELL")
     completion.add_argument("shell", type=Literal["bash", "zsh", "tcsh"])
     return parser
 

@@ -1,0 +1,71 @@
+import json
+import shutil
+
+import pytest
+import torch
+
+from corrmat import load_model, weights
+from corrmat.methods import InvariantCorr
+from corrmat.registration import shipping
+
+NETWORK = {"width": 32, "heads": 2, "layers": 1, "anchors": 8, "neighbors": 4}
+
+
+@pytest.fixture
+def checkpoint(tmp_path):
+    torch.manual_seed(0)
+    method = InvariantCorr(NETWORK)
+    content = {"state_dict": method.state_dict(), "hyper_parameters": dict(method.hparams)}
+    method.on_save_checkpoint(content)
+    torch.save(content, tmp_path / "last.ckpt")
+    return tmp_path / "last.ckpt"
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    """A copy of the shipped weights, few shapes and a calibration of few pairs."""
+    copy = tmp_path / "package" / weights.SHIPPED.name
+    copy.parent.mkdir()
+    shutil.copy(weights.SHIPPED, copy)
+    monkeypatch.setattr(weights, "SHIPPED", copy)
+    monkeypatch.setattr(shipping, "CALIBRATION_PAIRS", 8)
+    monkeypatch.setattr("corrmat.data.shapes.dataset.SIZE", {"train": 200, "test": 10})
+    return copy
+
+
+def test_a_checkpoint_becomes_the_weights_of_the_package(checkpoint, package, capsys):
+    shipping.ship(checkpoint)
+    assert package.name in capsys.readouterr().out
+    header = weights.shipped_metadata()
+    assert header["method"] == "InvariantCorr"
+    assert json.loads(header["network"]) == NETWORK
+    calibration = weights.shipped_calibration()
+    assert (len(calibration.both), len(calibration.agreement)) == (3, 2)
+    assert 0 < calibration.confidence(0.5, 0.5) < 1
+    trained, shipped = load_model(checkpoint).state_dict(), load_model().state_dict()
+    assert trained.keys() == shipped.keys()
+    assert all(torch.equal(trained[key], shipped[key]) for key in trained)
+
+
+def test_nothing_is_shipped_before_its_calibration_is_done(checkpoint, package, monkeypatch):
+    before = package.read_bytes()
+
+    def interrupted(*args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(shipping, "calibrate", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        shipping.ship(checkpoint)
+    assert package.read_bytes() == before
+    assert [path.name for path in package.parent.iterdir()] == [package.name]
+
+
+def test_the_calibration_finds_the_chance_that_made_the_pairs():
+    generator = torch.Generator().manual_seed(0)
+    agreement, support = torch.rand(2, 4000, generator=generator, dtype=torch.float64)
+    ones = torch.ones(4000, dtype=torch.float64)
+    logit = 6 * agreement + 3 * support - 4
+    right = (torch.rand(4000, generator=generator) < torch.sigmoid(logit)).double()
+    x = torch.stack([agreement, support, ones], 1).numpy()
+    fitted = torch.tensor(shipping._fit_logistic(x, right.numpy()))
+    torch.testing.assert_close(fitted, torch.tensor([6.0, 3.0, -4.0]), rtol=0.15, atol=0)
