@@ -11,10 +11,10 @@ def test_distance_from_the_origin_solves_pairs_without_translation(num_points):
     data = RegistrationDataModule(
         num_points=num_points, rotation_deg=180, translation=0, batch_size=8, test_shapes=8
     )
-    found = RegistrationMetrics()
+    actual = RegistrationMetrics()
     for batch in data.test_dataloader():
-        found.update(Radius()(batch.source, batch.target), batch)
-    values = found.compute()
+        actual.update(Radius()(batch.source, batch.target), batch)
+    values = actual.compute()
     assert values["match_accuracy"] > 0.999
     assert values["rotation_error_deg_mean"] < 0.05
 
@@ -22,13 +22,13 @@ def test_distance_from_the_origin_solves_pairs_without_translation(num_points):
 def test_distance_from_the_origin_says_nothing_once_there_is_a_translation():
     data = RegistrationDataModule(num_points=100, batch_size=8, test_shapes=8)
     batch = next(iter(data.test_dataloader()))
-    found = Radius()(batch.source, batch.target).correspondence.argmax()
-    assert (found == batch.match).double().mean() < 0.2
+    prediction = Radius()(batch.source, batch.target).correspondence.argmax()
+    assert (prediction == batch.match).double().mean() < 0.2
 
 
 def test_the_identity_is_as_wrong_as_the_pair_is_turned(generator):
     cloud = torch.randn(2, 5, 6, generator=generator)
-    found = Identity()(cloud, cloud)
-    assert torch.equal(found.rotation, torch.eye(3).expand(2, 3, 3))
-    assert torch.equal(found.translation, torch.zeros(2, 3))
-    assert found.correspondence is None
+    prediction = Identity()(cloud, cloud)
+    assert torch.equal(prediction.rotation, torch.eye(3).expand(2, 3, 3))
+    assert torch.equal(prediction.translation, torch.zeros(2, 3))
+    assert prediction.correspondence is None

@@ -40,17 +40,18 @@ def test_who_knows_the_truth_scores_everything_and_who_does_not_nothing(pairs, m
         if model == "wrong":
             transform[:3, 3] += 0.5
             transform[:3, :3] = transform[:3, :3] @ np.diag([1.0, -1, -1])
-        found = type("Found", (), {})()
-        found.transform, found.seconds, found.agreement, found.support = transform, 0.01, 1.0, 1.0
-        return found
+        result = type("Result", (), {})()
+        result.transform, result.seconds = transform, 0.01
+        result.agreement, result.support = 1.0, 1.0
+        return result
 
     monkeypatch.setattr(benchmark, "register", answer)
-    found = benchmark.compare(pairs, ["right", "wrong"])
-    assert found["right"].recall_5deg == found["right"].recall_adds == 1
-    assert found["right"].mean_deg < 0.05
-    assert found["wrong"].recall_5deg == found["wrong"].recall_adds == 0
-    assert found["wrong"].mean_deg == pytest.approx(180, abs=0.1)
-    assert found["right"].ms == pytest.approx(10)
+    rows = benchmark.compare(pairs, ["right", "wrong"])
+    assert rows["right"].recall_5deg == rows["right"].recall_adds == 1
+    assert rows["right"].mean_deg < 0.05
+    assert rows["wrong"].recall_5deg == rows["wrong"].recall_adds == 0
+    assert rows["wrong"].mean_deg == pytest.approx(180, abs=0.1)
+    assert rows["right"].ms == pytest.approx(10)
 
 
 def test_the_command_prints_one_table_and_writes_a_record(pairs, tmp_path, capsys):

@@ -67,5 +67,5 @@ def test_the_true_transform_has_no_transformation_loss(generator):
     assert transformation_loss(rotation, translation, rotation, translation) == 0
     turned = torch.diag(torch.tensor([1.0, -1, -1])).expand(4, 3, 3)
     expected = torch.tensor(8 / 9 + 4)
-    found = transformation_loss(turned, translation + 2, rotation, translation)
-    torch.testing.assert_close(found, expected)
+    actual = transformation_loss(turned, translation + 2, rotation, translation)
+    torch.testing.assert_close(actual, expected)

@@ -33,33 +33,33 @@ class Server:
 
         class Handler(http.server.BaseHTTPRequestHandler):
             def do_GET(self):
-                how = outer.behave.pop(0) if outer.behave else "well"
+                reply = outer.behave.pop(0) if outer.behave else "well"
                 wanted = self.headers.get("Range")
                 outer.ranges.append(wanted)
                 content, status = outer.content, 200
-                if how == "redirect":
+                if reply == "redirect":
                     self.send_response(302)
                     self.send_header("Location", outer.url)
                     self.end_headers()
                     return
-                if how in ("404", "503"):
-                    self.send_error(int(how))
+                if reply in ("404", "503"):
+                    self.send_error(int(reply))
                     return
-                if how == "416" or wanted and int(wanted[6:-1]) >= len(content):
+                if reply == "416" or wanted and int(wanted[6:-1]) >= len(content):
                     self.send_error(416)
                     return
-                if wanted and how != "no ranges":
+                if wanted and reply != "no ranges":
                     content, status = content[int(wanted[6:-1]) :], 206
-                if how == "wrong":
+                if reply == "wrong":
                     content = bytes(len(content))
                 self.send_response(status)
                 self.send_header("Content-Length", str(len(content)))
                 self.send_header("ETag", '"one"')
                 self.end_headers()
-                part = content[: len(content) // 2] if how in ("cut", "stall") else content
+                part = content[: len(content) // 2] if reply in ("cut", "stall") else content
                 self.wfile.write(part)
                 self.wfile.flush()
-                if how == "stall":
+                if reply == "stall":
                     outer.release.wait(20)
                 self.close_connection = True
 
@@ -73,11 +73,11 @@ class Server:
 
 @pytest.fixture
 def server():
-    made = Server()
-    yield made
-    made.release.set()
-    made.http.shutdown()
-    made.http.server_close()
+    server = Server()
+    yield server
+    server.release.set()
+    server.http.shutdown()
+    server.http.server_close()
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,9 @@
 """Smoke training of every experiment, and what a run promises besides its numbers."""
 
+import contextlib
 import csv
 import dataclasses
+import functools
 import io
 import json
 import math
@@ -64,11 +66,25 @@ def numbers(record):
     return [numbers(v) for v in record] if isinstance(record, list) else repr(record)
 
 
+@pytest.fixture(scope="module")
+def smoke_run(tmp_path_factory):
+    """Run an experiment at smoke scale, once for all tests: record, folder of results, output."""
+
+    @functools.cache
+    def run(identity):
+        folder = tmp_path_factory.mktemp(identity)
+        with contextlib.redirect_stdout(io.StringIO()) as printed:
+            record = experiment.run(load(identity), folder / "results", folder / "runs")
+        return record, folder / "results", printed.getvalue()
+
+    return run
+
+
 @pytest.mark.parametrize("identity", IDS)
-def test_smoke_run_leaves_a_whole_record(identity, tmp_path, capsys):
+def test_smoke_run_leaves_a_whole_record(identity, smoke_run):
     loaded = load(identity)
-    experiment.run(loaded, tmp_path / "results", tmp_path / "runs")
-    folder = tmp_path / "results" / "smoke" / "shapes" / identity
+    _, results, printed = smoke_run(identity)
+    folder = results / "smoke" / "shapes" / identity
     assert {p.name for p in folder.iterdir()} == {
         "metrics.json",
         "config.yaml",
@@ -100,15 +116,16 @@ def test_smoke_run_leaves_a_whole_record(identity, tmp_path, capsys):
     assert all(len(s.steps[-1].matched) == len(s.source) for s in snapshots)
     for picture in ("curves.png", "matches.png"):
         assert (folder / picture).read_bytes().startswith(b"\x89PNG")
-    assert "correct matches, %" in capsys.readouterr().out
-    assert not list((tmp_path / "results").rglob("*.partial"))
+    assert "correct matches, %" in printed
+    assert not list(results.rglob("*.partial"))
 
 
-def test_the_same_command_gives_the_same_numbers_bit_for_bit(tmp_path):
-    records = [experiment.run(load("1.2"), tmp_path / f"{i}", tmp_path / "runs") for i in range(2)]
-    assert numbers(records[0]) == numbers(records[1])
+def test_the_same_command_gives_the_same_numbers_bit_for_bit(tmp_path, smoke_run):
+    record = smoke_run("1.2")[0]
+    again = experiment.run(load("1.2"), tmp_path / "1", tmp_path / "runs")
+    assert numbers(record) == numbers(again)
     other = experiment.run(load("1.2", "--seed", "1"), tmp_path / "2", tmp_path / "runs")
-    assert numbers(other) != numbers(records[0])
+    assert numbers(other) != numbers(record)
 
 
 def test_test_pairs_that_are_not_the_recipes_are_named(tmp_path, capsys):
@@ -118,10 +135,10 @@ def test_test_pairs_that_are_not_the_recipes_are_named(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("identity", ["1.1", "2.4"])
-def test_per_pair_csv_alone_gives_every_rotation_metric_of_the_record(identity, tmp_path):
+def test_per_pair_csv_alone_gives_every_rotation_metric_of_the_record(identity, smoke_run):
     """Predict once, score many: 2.4 is tested in bands, whose rows follow each other."""
-    record = experiment.run(load(identity), tmp_path / "results", tmp_path / "runs")
-    folder = tmp_path / "results/smoke/shapes" / identity
+    record, results, _ = smoke_run(identity)
+    folder = results / "smoke/shapes" / identity
     table = list(csv.DictReader((folder / "per_pair.csv").open()))
     for arm, result in (record.arms | record.baselines).items():
         rows = [row for row in table if row["arm"] == arm]
@@ -159,15 +176,14 @@ def metrics_of(rotations, translation, true_translation):
     }
 
 
-def test_experiment_1_4_takes_the_networks_of_1_1(tmp_path, capsys):
+def test_experiment_1_4_takes_the_networks_of_1_1(tmp_path, capsys, smoke_run):
     first = experiment.run(load("1.1"), tmp_path / "results", tmp_path / "runs")
     capsys.readouterr()
     again = experiment.run(load("1.4"), tmp_path / "results", tmp_path / "runs")
     assert capsys.readouterr().out.count("trained already: ") == 2
     for arm in first.arms:
         assert again.arms[arm].curve == first.arms[arm].curve
-    alone = experiment.run(load("1.4"), tmp_path / "other", tmp_path / "other_runs")
-    assert numbers(alone) == numbers(again)
+    assert numbers(smoke_run("1.4")[0]) == numbers(again)
     capsys.readouterr()
     experiment.run(load("1.4", "--optimizer.lr", "1e-4"), tmp_path / "results", tmp_path / "runs")
     assert "trained already" not in capsys.readouterr().out  # other settings: not the same network
@@ -293,7 +309,7 @@ def test_the_last_step_is_validated_wherever_it_falls(tmp_path):
 
 
 def test_nothing_is_deleted_or_trained_when_the_test_split_cannot_be_read(tmp_path):
-    loaded = load("1.1")
+    loaded = load("1.1", arms=["DCP"])
     experiment.run(loaded, tmp_path / "results", tmp_path / "runs")
     best = tmp_path / "runs/smoke/shapes/1.1/DCP/best.ckpt"
     before = best.stat().st_mtime_ns
@@ -316,7 +332,7 @@ def test_nothing_is_deleted_or_trained_when_the_test_split_cannot_be_read(tmp_pa
         ["--trainer.precision", "16-mixed"],  # cannot clip
     ):
         with pytest.raises(CorrmatError):
-            experiment.run(load("1.1", *bad), tmp_path / "results", tmp_path / "runs")
+            experiment.run(load("1.1", *bad, arms=["DCP"]), tmp_path / "results", tmp_path / "runs")
         assert best.stat().st_mtime_ns == before
 
 
@@ -435,11 +451,11 @@ def test_a_board_that_nobody_watches_draws_nothing(tmp_path):
 @pytest.mark.parametrize("arm", ["1.1 DCP", "2.2 RPMNet_corr", "3.2 PCRNet"])
 def test_a_machine_that_is_fast_in_bfloat16_trains_in_it(arm, tmp_path, monkeypatch):
     monkeypatch.setattr(hardware, "fast_precision", lambda accelerator: "bf16-mixed")
-    seen = []
+    dtypes = []
     original = RegistrationModule.training_step
 
     def noted(self, batch, batch_index):
-        seen.append((self.trainer.precision, torch.is_autocast_enabled("cpu")))
+        dtypes.append((self.trainer.precision, torch.is_autocast_enabled("cpu")))
         return original(self, batch, batch_index)
 
     monkeypatch.setattr(RegistrationModule, "training_step", noted)
@@ -448,7 +464,7 @@ def test_a_machine_that_is_fast_in_bfloat16_trains_in_it(arm, tmp_path, monkeypa
     assert loaded.arms[name].trainer.gradient_clip_val
     ready = prepare(loaded.arms[name])
     trained = fit.train(ready, tmp_path / name)
-    assert set(seen) == {("bf16-mixed", True)}
+    assert set(dtypes) == {("bf16-mixed", True)}
     assert math.isfinite(trained.curve[-1]["loss"])
     (pairs,) = fit.score(fit.load_trained(ready, trained.checkpoint), ready)
     assert pairs["rotation_error_deg"].isfinite().all()

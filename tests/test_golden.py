@@ -29,19 +29,19 @@ def test_dcp_in_evaluation_mode(name):
     network = load_reference("dcp", state_of(arrays), **hparams)
     source, target = arrays["source"], arrays["target"]
     with torch.no_grad():
-        found = network(source, target)
+        prediction = network(source, target)
         for side, cloud in (("source", source), ("target", target)):
             close(network.embed(cloud).mT, arrays[f"feature_{side}"], 1e-4)
-    close(found.correspondence.logits(), arrays["scores"], 1e-4)
-    close(found.rotation, arrays["rotation_pred"], 1e-4)
-    close(found.translation, arrays["translation_pred"], 1e-4)
+    close(prediction.correspondence.logits(), arrays["scores"], 1e-4)
+    close(prediction.rotation, arrays["rotation_pred"], 1e-4)
+    close(prediction.translation, arrays["translation_pred"], 1e-4)
     close(
-        correspondence_loss(found.correspondence, arrays["correspondence"]),
+        correspondence_loss(prediction.correspondence, arrays["correspondence"]),
         arrays["loss_correspondence"],
         1e-5,
     )
     loss = transformation_loss(
-        found.rotation, found.translation, arrays["rotation"], arrays["translation"]
+        prediction.rotation, prediction.translation, arrays["rotation"], arrays["translation"]
     )
     close(loss, arrays["loss_transformation"], 1e-5)
 
@@ -90,9 +90,9 @@ def test_pretrained_dcp_v1():
         for k, v in np.load(shared("reference", "dcp_v1_outputs.npz")).items()
     }
     with torch.no_grad():
-        found = load_reference("dcp", state)(outputs["source"], outputs["target"])
-    close(found.rotation, outputs["rotation_pred"], 1e-3)
-    close(found.translation, outputs["translation_pred"], 1e-3)
+        prediction = load_reference("dcp", state)(outputs["source"], outputs["target"])
+    close(prediction.rotation, outputs["rotation_pred"], 1e-3)
+    close(prediction.translation, outputs["translation_pred"], 1e-3)
 
 
 def as_batch(arrays):
@@ -120,9 +120,9 @@ def test_rpmnet(name):
     arrays, hparams = golden(name)
     network = load_reference("rpmnet", state_of(arrays), **hparams)
     with torch.no_grad():
-        found = network(arrays["source"], arrays["target"])
-    assert len(found.steps) == 2
-    for i, step in enumerate(found.steps):
+        prediction = network(arrays["source"], arrays["target"])
+    assert len(prediction.steps) == 2
+    for i, step in enumerate(prediction.steps):
         close(step.correspondence.beta, arrays["beta"][i], 1e-4)
         close(step.correspondence.alpha, arrays["alpha"][i], 1e-4)
         close(step.correspondence.prob(), arrays[f"perm_matrix_{i}"], 1e-4)
@@ -131,10 +131,12 @@ def test_rpmnet(name):
     batch = as_batch(arrays)
     relative_error = {"rtol": 1e-5, "atol": 0}
     torch.testing.assert_close(
-        CorrespondenceLoss().loss(found, batch), arrays["loss_correspondence"], **relative_error
+        CorrespondenceLoss().loss(prediction, batch),
+        arrays["loss_correspondence"],
+        **relative_error,
     )
     torch.testing.assert_close(
-        RegistrationLoss().loss(found, batch), arrays["loss_rpmnet"], **relative_error
+        RegistrationLoss().loss(prediction, batch), arrays["loss_rpmnet"], **relative_error
     )
 
 
@@ -162,8 +164,8 @@ def test_rpmnet_gradients_as_they_are():
     for name, tolerance in (("rpmnet_partial", 1e-3), ("rpmnet", 2e-2)):
         arrays, hparams = golden(name)
         network = load_reference("rpmnet", state_of(arrays), **hparams).train()
-        found = network(arrays["source"], arrays["target"])
-        CorrespondenceLoss().loss(found, as_batch(arrays)).backward()
+        prediction = network(arrays["source"], arrays["target"])
+        CorrespondenceLoss().loss(prediction, as_batch(arrays)).backward()
         assert worst_gradient("rpmnet", network, arrays) < tolerance
 
 
@@ -171,14 +173,16 @@ def test_pcrnet():
     arrays, hparams = golden("pcrnet")
     network = load_reference("pcrnet", state_of(arrays), **hparams)
     source, target = arrays["source"], arrays["target"]
-    found = network(source, target)
-    assert len(found.steps) == hparams["iterations"]
-    close(found.rotation, arrays["est_R"], 1e-4)
-    close(found.translation, arrays["est_t"].squeeze(1), 1e-4)
+    prediction = network(source, target)
+    assert len(prediction.steps) == hparams["iterations"]
+    close(prediction.rotation, arrays["est_R"], 1e-4)
+    close(prediction.translation, arrays["est_t"].squeeze(1), 1e-4)
     close(
-        rigid.apply(found.rotation, found.translation, source), arrays["transformed_source"], 1e-4
+        rigid.apply(prediction.rotation, prediction.translation, source),
+        arrays["transformed_source"],
+        1e-4,
     )
-    loss = ChamferLoss().loss(found, as_batch(arrays))
+    loss = ChamferLoss().loss(prediction, as_batch(arrays))
     torch.testing.assert_close(loss, arrays["loss_chamfer"], rtol=1e-3, atol=0)
     loss.backward()
     assert worst_gradient("pcrnet", network, arrays) < 1e-3
@@ -203,12 +207,14 @@ def test_pcrnet_corr():
     arrays, hparams = golden("pcrnet_corr")
     network = load_reference("pcrnet_corr", state_of(arrays), **hparams)
     batch, relative_error = as_batch(arrays), {"rtol": 1e-5, "atol": 0}
-    found = network(arrays["source"], arrays["target"])
-    close(found.correspondence.logits(), arrays["scores"], 1e-6)
-    close(found.rotation, arrays["rotation_pred"], float32_pose_error(arrays))
-    close(found.translation, arrays["translation_pred"], 1e-4)
+    prediction = network(arrays["source"], arrays["target"])
+    close(prediction.correspondence.logits(), arrays["scores"], 1e-6)
+    close(prediction.rotation, arrays["rotation_pred"], float32_pose_error(arrays))
+    close(prediction.translation, arrays["translation_pred"], 1e-4)
     torch.testing.assert_close(
-        CorrespondenceLoss().loss(found, batch), arrays["loss_correspondence"], **relative_error
+        CorrespondenceLoss().loss(prediction, batch),
+        arrays["loss_correspondence"],
+        **relative_error,
     )
     network.train()
     loss = CorrespondenceLoss().loss(network(arrays["source"], arrays["target"]), batch)
@@ -248,13 +254,13 @@ def test_metrics():
     close((shift.square().mean() / 3).sqrt(), arrays["translation_rmse"], 1e-9)
 
 
-def close(found, expected, tolerance):
-    torch.testing.assert_close(found, expected, rtol=tolerance, atol=tolerance)
+def close(actual, expected, tolerance):
+    torch.testing.assert_close(actual, expected, rtol=tolerance, atol=tolerance)
 
 
-def relative(found, expected):
-    expected = expected.reshape(found.shape).double()
-    return float((found.double() - expected).norm() / expected.norm())
+def relative(actual, expected):
+    expected = expected.reshape(actual.shape).double()
+    return float((actual.double() - expected).norm() / expected.norm())
 
 
 def loss_and_gradients(arrays, hparams, dtype, seed=None):

@@ -23,21 +23,21 @@ def oriented(generator, count=50):
 
 def test_pair_features_do_not_change_with_the_pose_or_a_normals_sign(generator):
     offset, n, m = oriented(generator)
-    found = signless_pair_features(offset, n, m)
-    assert found.shape == (50, SIGNLESS)
+    features = signless_pair_features(offset, n, m)
+    assert features.shape == (50, SIGNLESS)
     turn = random_rotation(1, generator)[0].T
-    torch.testing.assert_close(signless_pair_features(offset @ turn, n @ turn, m @ turn), found)
-    torch.testing.assert_close(signless_pair_features(offset, -n, m), found)
-    torch.testing.assert_close(signless_pair_features(offset, n, -m), found)
+    torch.testing.assert_close(signless_pair_features(offset @ turn, n @ turn, m @ turn), features)
+    torch.testing.assert_close(signless_pair_features(offset, -n, m), features)
+    torch.testing.assert_close(signless_pair_features(offset, n, -m), features)
 
 
 def test_pair_features_tell_a_pair_from_its_mirror_image_and_a_bend_from_a_step(generator):
     offset, n, m = oriented(generator)
     mirror = torch.tensor([-1.0, 1, 1], dtype=torch.float64)
-    found = signless_pair_features(offset, n, m)
+    features = signless_pair_features(offset, n, m)
     mirrored = signless_pair_features(offset * mirror, n * mirror, m * mirror)
-    torch.testing.assert_close(mirrored[:, :-1], found[:, :-1])
-    torch.testing.assert_close(mirrored[:, -1], -found[:, -1])
+    torch.testing.assert_close(mirrored[:, :-1], features[:, :-1])
+    torch.testing.assert_close(mirrored[:, -1], -features[:, -1])
     x = torch.tensor([1.0, 0, 0])
     left, right = F.normalize(torch.tensor([[-0.5, 1, 0], [0.5, 1, 0]]), dim=-1)
     bend, step = signless_pair_features(x, left, right), signless_pair_features(x, right, right)
@@ -66,16 +66,16 @@ def network():
 
 def test_logits_do_not_change_with_pose_units_and_signs_and_the_motion_follows(network, generator):
     source, target = pair(generator)
-    found = network(source, target)
+    prediction = network(source, target)
     turn, shift = random_rotation(1, generator)[0], torch.tensor([5.0, -3, 2]).double()
     signs = torch.where(torch.rand(2, 60, 1, generator=generator) < 0.5, -1.0, 1.0)
     moved = torch.cat([source[..., :3] @ turn.T + shift, signs * source[..., 3:] @ turn.T], -1)
     again = network(moved, target)
-    torch.testing.assert_close(again.correspondence.logits(), found.correspondence.logits())
-    torch.testing.assert_close(again.rotation @ turn, found.rotation)
+    torch.testing.assert_close(again.correspondence.logits(), prediction.correspondence.logits())
+    torch.testing.assert_close(again.rotation @ turn, prediction.rotation)
     grown = [torch.cat([1000 * c[..., :3], c[..., 3:]], -1) for c in (source, target)]
     larger = network(*grown)
-    torch.testing.assert_close(larger.correspondence.logits(), found.correspondence.logits())
+    torch.testing.assert_close(larger.correspondence.logits(), prediction.correspondence.logits())
 
 
 def test_the_network_learns_at_its_neighbourhoods_and_at_its_end(network, generator):
@@ -139,7 +139,7 @@ def test_the_streamed_matchability_is_the_whole_ones(generator, monkeypatch):
         for s in ((5, 4), (7, 4), (5,), (7,), (7, 3))
     )
     index = torch.tensor([[0, 6, 7, -1, 3], [1, 2, 7, 7, 0]])
-    found = []
+    results = []
     for most in (2**23, 0):
         monkeypatch.setattr(streaming, "_DENSE", most)
         monkeypatch.setattr(streaming, "_SLICE", 20)
@@ -148,8 +148,8 @@ def test_the_streamed_matchability_is_the_whole_ones(generator, monkeypatch):
         matrix = MatchabilityCorrespondence(a, b, 0.5, c, d)
         values = matrix.nll(index), matrix.soft_target(y), matrix.weight()
         grads = torch.autograd.grad(sum(v.square().sum() for v in values), inputs)
-        found.append([*values, *grads])
-    for whole, streamed in zip(*found, strict=True):
+        results.append([*values, *grads])
+    for whole, streamed in zip(*results, strict=True):
         torch.testing.assert_close(whole, streamed)
 
 
@@ -168,9 +168,9 @@ def test_a_perfect_prediction_costs_next_to_nothing(generator):
 def test_the_method_learns_eight_pairs_of_two_scans(generator):
     """Halfway; `test_learning.py` has simpler pairs learnt by heart."""
     torch.manual_seed(0)
-    how = PairSettings(64, keep=0.7, sampling="disjoint", outliers=0.05, outlier_distance=0.2,
+    settings = PairSettings(64, keep=0.7, sampling="disjoint", outliers=0.05, outlier_distance=0.2,
         corrupted="both", normals="estimated")  # fmt: skip
-    batch = make_pairs(load("train", 8), range(8), [Key(0, 0, 0, i) for i in range(8)], how)
+    batch = make_pairs(load("train", 8), range(8), [Key(0, 0, 0, i) for i in range(8)], settings)
     network = {"width": 32, "heads": 2, "layers": 1, "anchors": 16, "neighbors": 4}
     method = InvariantCorr(network, loss={"max_distance": 0.2})
     adam = torch.optim.Adam(method.parameters(), 3e-3)

@@ -31,14 +31,14 @@ def perfect(batch):
 def test_a_perfect_prediction_has_the_perfect_score(batch):
     scores = metrics.RegistrationMetrics()
     scores.update(perfect(batch), batch)
-    found = scores.compute()
-    assert found.pop("match_accuracy") == 1
-    assert found.pop("recall@5deg_0.05") == 1
-    assert found.pop("pairs") == 6
-    assert math.isnan(found.pop("transposed_match_accuracy"))  # asks for clouds of one size
-    assert math.isnan(found.pop("outlier_precision"))  # no such class
-    assert math.isnan(found.pop("outlier_recall"))
-    assert all(value == pytest.approx(0, abs=1e-5) for value in found.values()), found
+    values = scores.compute()
+    assert values.pop("match_accuracy") == 1
+    assert values.pop("recall@5deg_0.05") == 1
+    assert values.pop("pairs") == 6
+    assert math.isnan(values.pop("transposed_match_accuracy"))  # asks for clouds of one size
+    assert math.isnan(values.pop("outlier_precision"))  # no such class
+    assert math.isnan(values.pop("outlier_recall"))
+    assert all(value == pytest.approx(0, abs=1e-5) for value in values.values()), values
 
 
 def test_the_released_match_count_gives_a_perfect_prediction_almost_nothing():
@@ -58,10 +58,10 @@ def test_the_released_match_count_gives_a_perfect_prediction_almost_nothing():
 def test_angles_are_exact_near_zero_and_near_180():
     for angle in (0.0, 1e-6, 1e-3, 1.0, 90.0, 179.0, 179.9999, 180.0):
         turned = Rotation.from_rotvec([0, 0, math.radians(angle)]).as_matrix()
-        found = metrics.rotation_error_deg(
+        actual = metrics.rotation_error_deg(
             torch.eye(3).double()[None], torch.from_numpy(turned)[None]
         )
-        assert float(found) == pytest.approx(angle, abs=1e-9)
+        assert float(actual) == pytest.approx(angle, abs=1e-9)
 
 
 def test_the_same_rotation_in_float32_is_no_error(generator):
@@ -90,13 +90,13 @@ def test_chamfer_equals_its_twin(batch, generator):
         random_rotation(6, generator).float(), torch.randn(6, 3, generator=generator)
     )
     batch.clean = batch.clean[:, :50]
-    found = metrics.chamfer(prediction, batch)
+    actual = metrics.chamfer(prediction, batch)
     moved = rigid.apply(prediction.rotation, prediction.translation, batch.source[..., :3])
     clean_target = rigid.apply(batch.rotation, batch.translation, batch.clean)
     clean_source = rigid.apply(prediction.rotation, prediction.translation, batch.clean)
     for i in range(2):
         twin = chamfer_loops(moved[i], clean_target[i], batch.target[i, :, :3], clean_source[i])
-        assert float(found[i]) == pytest.approx(twin, rel=1e-5)
+        assert float(actual[i]) == pytest.approx(twin, rel=1e-5)
 
 
 def test_batches_of_any_size_give_one_result(batch):
@@ -128,10 +128,10 @@ def test_no_answer_is_counted_and_never_scored_as_one(batch):
     broken.rotation[2] = torch.nan
     scores = metrics.RegistrationMetrics()
     scores.update(broken, batch)
-    found = scores.compute()
-    assert found["failed"] == 1
-    assert math.isnan(found["rotation_error_deg_mean"])
-    assert found["recall@5deg_0.05"] == pytest.approx(5 / 6)
+    values = scores.compute()
+    assert values["failed"] == 1
+    assert math.isnan(values["rotation_error_deg_mean"])
+    assert values["recall@5deg_0.05"] == pytest.approx(5 / 6)
 
 
 def test_a_network_without_matches_has_no_match_accuracy(batch):

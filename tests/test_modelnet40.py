@@ -29,8 +29,8 @@ def root(tmp_path):
     return tmp_path
 
 
-def module(root, **how):
-    return RegistrationDataModule("modelnet40", root=str(root), num_points=16, **how)
+def module(root, **options):
+    return RegistrationDataModule("modelnet40", root=str(root), num_points=16, **options)
 
 
 def test_files_are_read_in_order_from_the_folder_or_its_parent(root):
@@ -114,18 +114,20 @@ def test_estimated_normals_are_right_outward_and_turn_with_the_cloud():
     rng = np.random.default_rng(0)
     sphere = rng.standard_normal((1000, 3))
     sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
-    found = normals.estimate_normals(5 + 0.1 * sphere)
-    assert (found * sphere).sum(1).min() > 0.95
+    estimate = normals.estimate_normals(5 + 0.1 * sphere)
+    assert (estimate * sphere).sum(1).min() > 0.95
     turn = Rotation.from_rotvec([0.3, -1.0, 2.0]).as_matrix()
-    np.testing.assert_allclose(normals.estimate_normals(sphere @ turn.T), found @ turn.T, atol=2e-3)
+    np.testing.assert_allclose(
+        normals.estimate_normals(sphere @ turn.T), estimate @ turn.T, atol=2e-3
+    )
 
 
 @pytest.mark.parametrize(
     "cloud", [np.zeros((6, 3)), np.eye(3)[:1], np.outer(np.arange(9), [1, 2, 3])]
 )
 def test_estimated_normals_of_degenerate_clouds_are_units(cloud):
-    found = normals.estimate_normals(cloud.astype(np.float32))
-    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-5)
+    estimate = normals.estimate_normals(cloud.astype(np.float32))
+    np.testing.assert_allclose(np.linalg.norm(estimate, axis=1), 1, atol=1e-5)
 
 
 def test_what_does_not_fit_the_data_is_named(root):

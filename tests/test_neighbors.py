@@ -15,8 +15,8 @@ def test_within_radius_takes_the_lowest_indices(chunk, generator, monkeypatch):
     monkeypatch.setattr(neighbors, "_CHUNK", chunk)
     points = torch.randn(2, 20, 3, generator=generator, dtype=torch.float64)
     for radius, k in ((0.8, 4), (2.0, 6), (0.01, 3), (100.0, 25)):
-        found = within_radius(points, radius, k)
-        assert torch.equal(found, within_radius_loops(points, radius, k))
+        actual = within_radius(points, radius, k)
+        assert torch.equal(actual, within_radius_loops(points, radius, k))
 
 
 def test_the_border_is_inside_and_copies_are_neighbours():
@@ -46,9 +46,9 @@ def test_knn_is_exact_slice_by_slice(chunk, generator, monkeypatch):
 
 def test_pair_features_are_angles_and_a_distance():
     up, right = torch.tensor([0.0, 0, 1]), torch.tensor([1.0, 0, 0])
-    found = point_pair_features(2 * right, up, right)
+    features = point_pair_features(2 * right, up, right)
     expected = torch.tensor([math.pi / 2, 0.0, math.pi / 2, 2.0])
-    torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(features, expected)
     assert (point_pair_features(torch.zeros(3), up, up) == 0).all()  # a place left over
 
 

@@ -84,12 +84,12 @@ def test_folded_group_norm_equals_the_plain_network(slab, monkeypatch, generator
     cloud = torch.randn(2, 9, 6, dtype=torch.float64, generator=generator)
     local = neighborhoods(cloud, 1.5, 5)
     pull = torch.randn(2, 9, 16, dtype=torch.float64, generator=generator)
-    found = []
+    results = []
     for value in (network(local), neighborhood_net(local.features(), network)):
         network.zero_grad()
         (value * pull).sum().backward()
-        found.append([value, *(p.grad.clone() for p in network.parameters())])
-    for fast, naive in zip(*found, strict=True):
+        results.append([value, *(p.grad.clone() for p in network.parameters())])
+    for fast, naive in zip(*results, strict=True):
         torch.testing.assert_close(fast, naive, rtol=1e-8, atol=1e-9)
 
 

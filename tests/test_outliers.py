@@ -22,20 +22,20 @@ def features(generator):
 
 def test_the_outliers_feature_agrees_with_the_reference():
     arrays, _ = golden("outlier_embedding")
-    found = outlier_feature(arrays["feature_target"].mT, float(arrays["b"]))
-    torch.testing.assert_close(found, arrays["outlier_embedding"], rtol=1e-6, atol=1e-6)
+    feature = outlier_feature(arrays["feature_target"].mT, float(arrays["b"]))
+    torch.testing.assert_close(feature, arrays["outlier_embedding"], rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("m", [9, 16, 40])
 def test_the_outliers_feature_is_the_least_squares_solution(m, generator):
     f_y = torch.randn(2, m, 16, generator=generator, dtype=torch.float64, requires_grad=True)
-    found = outlier_feature(f_y)
+    feature = outlier_feature(f_y)
     expected = -(torch.linalg.pinv(f_y) @ torch.ones(2, m, 1, dtype=torch.float64)).squeeze(-1)
-    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(feature, expected, rtol=1e-5, atol=1e-5)
     if m <= 16:
-        scores = (f_y @ found.unsqueeze(-1)).squeeze(-1)
+        scores = (f_y @ feature.unsqueeze(-1)).squeeze(-1)
         torch.testing.assert_close(scores, -torch.ones_like(scores), rtol=1e-5, atol=1e-5)
-    gradient = torch.autograd.grad(found.sum(), f_y)[0]
+    gradient = torch.autograd.grad(feature.sum(), f_y)[0]
     torch.testing.assert_close(
         gradient, torch.autograd.grad(expected.sum(), f_y)[0], rtol=1e-3, atol=1e-3
     )
@@ -43,9 +43,9 @@ def test_the_outliers_feature_is_the_least_squares_solution(m, generator):
 
 def test_features_of_zero_have_a_finite_outlier():
     f_y = torch.zeros(1, 5, 4, requires_grad=True)
-    found = outlier_feature(f_y)
-    found.sum().backward()
-    assert (found == 0).all()
+    feature = outlier_feature(f_y)
+    feature.sum().backward()
+    assert (feature == 0).all()
     assert f_y.grad.isfinite().all()
 
 
@@ -105,11 +105,11 @@ def test_dcp_learns_with_each_of_them(way):
     torch.manual_seed(0)
     batch = outlier_batch()
     network = DCPNetwork(16, "transformer", 2, 16, (8, 8, 12, 16), 5, way).train()
-    found = network(batch.source, batch.target)
-    loss = correspondence_loss(found.correspondence, batch.match)
-    (loss + found.rotation.sum()).backward()
+    prediction = network(batch.source, batch.target)
+    loss = correspondence_loss(prediction.correspondence, batch.match)
+    (loss + prediction.rotation.sum()).backward()
     assert all(p.grad is not None and p.grad.isfinite().all() for p in network.parameters())
-    assert (found.correspondence.outlier is None) == (way == "none")
+    assert (prediction.correspondence.outlier is None) == (way == "none")
 
 
 def test_perfect_weights_give_the_perfect_pose():
@@ -127,9 +127,9 @@ def test_perfect_weights_give_the_perfect_pose():
     )
     scores = metrics.RegistrationMetrics()
     scores.update(prediction, batch)
-    found = scores.compute()
-    assert found["match_accuracy"] == found["outlier_precision"] == found["outlier_recall"] == 1
-    assert found["rotation_error_deg_mean"] < 1e-3
+    values = scores.compute()
+    assert values["match_accuracy"] == values["outlier_precision"] == values["outlier_recall"] == 1
+    assert values["rotation_error_deg_mean"] < 1e-3
 
 
 def test_precision_and_recall_of_the_outlier_class():

@@ -40,17 +40,17 @@ def results(tmp_path):
         ],
     }
     for identity in ("1.1", "outliers"):
-        found = json.loads(json.dumps(null_for_nan(RECORD))) | {"id": identity}
+        content = json.loads(json.dumps(null_for_nan(RECORD))) | {"id": identity}
         folder = root / "smoke" / "shapes" / identity
         folder.mkdir(parents=True)
-        for arm in found["arms"].values():
+        for arm in content["arms"].values():
             arm["trained_at"] = "0" * 12
         if identity == "1.1":
-            for arm in found["arms"].values():
+            for arm in content["arms"].values():
                 arm["bands"] = [{"band_deg": [0, 30], "match_accuracy": 0.5}]
             snapshots = [view | {"rank": rank} for rank in ("easiest", "median", "hardest")]
             (folder / "snapshots.json").write_text(json.dumps(snapshots))
-        (folder / "metrics.json").write_text(json.dumps(found))
+        (folder / "metrics.json").write_text(json.dumps(content))
         rows = ["arm,rotation_error_deg", "DCP,30", "DCP,20", "DCP_corr,1", "DCP_corr,nan"]
         (folder / "per_pair.csv").write_text("\n".join(rows))
     robustness.run(root / "smoke" / "robustness", draws=2)
@@ -61,9 +61,9 @@ def test_every_section_is_there_and_nothing_is_fetched(results):
     html = build_page(results)
     for name in ("summary", "exp-1.1", "exp-outliers", "smoke-shapes-1.1", "robustness"):
         assert f'id="{name}"' in html
-    own = html[: html.index("<script>")]  # plotly's code names addresses that it never asks here
-    assert not re.search(r"""(src|href)=["']?(https?:)?//""", own)
-    assert "@import" not in own
+    page = html[: html.index("<script>")]  # plotly's code names addresses that it never asks here
+    assert not re.search(r"""(src|href)=["']?(https?:)?//""", page)
+    assert "@import" not in page
     assert len(html) < 8e6
     assert "0 to 30 deg: correct matches, %" in html
     assert "commit 000000000000 is not at hand" in html
@@ -94,24 +94,24 @@ def test_a_record_of_ones_own_recipe_has_no_make_target():
 
 def test_the_slider_of_a_view_shows_one_stage_at_a_time(results):
     snapshot = json.loads((results / "smoke/shapes/1.1/snapshots.json").read_text())[0]
-    found = plots.snapshot_plot(PairSnapshot.from_json(snapshot))
-    steps = found["layout"]["sliders"][0]["steps"]
+    actual = plots.snapshot_plot(PairSnapshot.from_json(snapshot))
+    steps = actual["layout"]["sliders"][0]["steps"]
     assert [step["label"] for step in steps] == ["before", "iteration 1"]
     for step in steps:
         assert sum(step["args"][0]["visible"]) == 5
-    names = [trace["name"] for trace in found["data"][5:]]
+    names = [trace["name"] for trace in actual["data"][5:]]
     assert names == ["target", "source", "right matches", "wrong matches", "called outlier"]
-    assert found["data"][8]["x"] == [1.0, 0.0, None]  # the one wrong match: 1 -> 2
-    assert found["data"][9]["z"] == [1.0]  # the outlier, moved by the transform
+    assert actual["data"][8]["x"] == [1.0, 0.0, None]  # the one wrong match: 1 -> 2
+    assert actual["data"][9]["z"] == [1.0]  # the outlier, moved by the transform
 
 
 def test_a_record_whose_code_has_changed_is_marked(tmp_path):
     def git(*words):
         identity = ["-c", "user.name=t", "-c", "user.email=t@t"]
-        found = subprocess.run(
+        process = subprocess.run(
             ["git", *identity, *words], cwd=tmp_path, capture_output=True, text=True, check=True
         )
-        return found.stdout.strip()
+        return process.stdout.strip()
 
     code = tmp_path / "src" / "corrmat" / "losses.py"
     code.parent.mkdir(parents=True)
@@ -192,7 +192,7 @@ def test_a_browser_draws_all_of_it_without_a_complaint(width, results, tmp_path)
     (tmp_path / "report.html").write_text(build_page(results))
     path = tmp_path / "frame.html"
     path.write_text(FRAME.format(width=width))
-    found = subprocess.run(
+    process = subprocess.run(
         [
             BROWSER, "--headless", "--no-sandbox", "--enable-unsafe-swiftshader",
             "--use-angle=swiftshader", "--enable-logging=stderr",
@@ -202,12 +202,12 @@ def test_a_browser_draws_all_of_it_without_a_complaint(width, results, tmp_path)
         capture_output=True, text=True, timeout=100,
     )  # fmt: skip
     hints = "GL Driver Message", "Canvas2D: "  # of plotly's speed, not of a mistake
-    lines = [line for line in found.stderr.splitlines() if "CONSOLE" in line]
+    lines = [line for line in process.stderr.splitlines() if "CONSOLE" in line]
     said = [line for line in lines if not any(hint in line for hint in hints)]
     assert not said, said
-    seen = json.loads(re.search(r'<pre id="said">(.+?)</pre>', found.stdout)[1])
-    assert seen["width"] <= width
-    assert seen["drawn"] == seen["plots"] >= 8
-    assert seen["views"] >= 3
-    assert {"summary", "exp-1.1", "exp-outliers", "robustness"} <= set(seen["sections"])
-    assert seen["untitled"] == seen["lost"] == 0
+    shown = json.loads(re.search(r'<pre id="said">(.+?)</pre>', process.stdout)[1])
+    assert shown["width"] <= width
+    assert shown["drawn"] == shown["plots"] >= 8
+    assert shown["views"] >= 3
+    assert {"summary", "exp-1.1", "exp-outliers", "robustness"} <= set(shown["sections"])
+    assert shown["untitled"] == shown["lost"] == 0

@@ -20,9 +20,11 @@ def clouds():
     return CloudSet(np.concatenate([points, normals], -1), np.zeros(5, np.int64), ("thing",))
 
 
-def pairs_of(clouds, epoch=0, **how):
+def pairs_of(clouds, epoch=0, **options):
     keys = [Key(0, 0, epoch, i) for i in range(len(clouds))]
-    return make_pairs(clouds, range(len(clouds)), keys, PairSettings(**{"num_points": 40} | how))
+    return make_pairs(
+        clouds, range(len(clouds)), keys, PairSettings(**{"num_points": 40} | options)
+    )
 
 
 def aligned(pairs):
@@ -45,10 +47,10 @@ def test_the_true_motion_takes_each_point_and_normal_onto_its_match(clouds, keep
 
 
 @pytest.mark.parametrize(
-    "how", [{}, {"keep": 0.7}, {"sampling": "independent"}, {"sampling": "disjoint"}]
+    "options", [{}, {"keep": 0.7}, {"sampling": "independent"}, {"sampling": "disjoint"}]
 )
-def test_the_match_is_the_nearest_target_point(clouds, how):
-    pairs = pairs_of(clouds, **how)
+def test_the_match_is_the_nearest_target_point(clouds, options):
+    pairs = pairs_of(clouds, **options)
     nearest = torch.cdist(aligned(pairs), pairs.target[..., :3]).argmin(-1)
     assert torch.equal(pairs.match, nearest)
 
@@ -87,8 +89,8 @@ def test_a_crop_leaves_one_side_of_a_plane_through_the_centroid(clouds):
 
 
 def test_angles_and_translations_stay_in_their_range_and_fill_it(clouds):
-    def angles(**how):
-        drawn = torch.cat([pairs_of(clouds, epoch, **how).rotation for epoch in range(60)])
+    def angles(**options):
+        drawn = torch.cat([pairs_of(clouds, epoch, **options).rotation for epoch in range(60)])
         cosine = (drawn.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
         return torch.rad2deg(torch.acos(cosine.clamp(-1, 1)))
 
@@ -166,9 +168,9 @@ def test_settings_out_of_range_are_named(change):
         PairSettings(**change)
 
 
-def datamodule(**how):
+def datamodule(**options):
     return RegistrationDataModule(
-        num_points=32, batch_size=5, train_shapes=24, test_shapes=7, **how
+        num_points=32, batch_size=5, train_shapes=24, test_shapes=7, **options
     )
 
 
@@ -178,13 +180,13 @@ def all_items(loader):
 
 @pytest.mark.parametrize("split", ["train", "val", "test"])
 def test_batches_are_equal_for_any_number_of_workers(split):
-    found = []
+    results = []
     for workers in (0, 1, 2):
         loader = getattr(datamodule(num_workers=workers), f"{split}_dataloader")()
         loader.sampler.set_epoch(3)
-        found.append(all_items(loader))
-    assert len(found[0]) > 0
-    for batches in zip(*found, strict=True):
+        results.append(all_items(loader))
+    assert len(results[0]) > 0
+    for batches in zip(*results, strict=True):
         for fields in zip(*batches, strict=True):
             assert all(torch.equal(fields[0], other) for other in fields[1:])
 

@@ -32,8 +32,8 @@ def test_chamfer_loss_of_equal_clouds_is_zero_with_a_finite_gradient(generator):
 def test_quaternions_have_w_first_and_need_not_be_units():
     turns = Rotation.random(4, random_state=0)
     x, y, z, w = torch.from_numpy(turns.as_quat()).T
-    found = quaternion_to_matrix(3 * torch.stack([w, x, y, z], -1))
-    torch.testing.assert_close(found, torch.from_numpy(turns.as_matrix()))
+    actual = quaternion_to_matrix(3 * torch.stack([w, x, y, z], -1))
+    torch.testing.assert_close(actual, torch.from_numpy(turns.as_matrix()))
 
 
 def test_the_pose_network_starts_near_the_identity(generator):
@@ -41,25 +41,27 @@ def test_the_pose_network_starts_near_the_identity(generator):
     network = PCRNetwork(64).eval()
     source = torch.randn(3, 30, 3, generator=generator)
     shift = torch.tensor([5.0, 0, 0])
-    found = network(source, source + shift)
-    angle = torch.rad2deg(torch.acos(((found.rotation.diagonal(dim1=1, dim2=2).sum(1)) - 1) / 2))
-    assert len(found.steps) == 8
+    prediction = network(source, source + shift)
+    angle = torch.rad2deg(
+        torch.acos(((prediction.rotation.diagonal(dim1=1, dim2=2).sum(1)) - 1) / 2)
+    )
+    assert len(prediction.steps) == 8
     assert (angle < 20).all()
-    assert found.correspondence is None
-    assert ((found.translation - shift).norm(dim=1) < 1).all()  # clouds are centred first
+    assert prediction.correspondence is None
+    assert ((prediction.translation - shift).norm(dim=1) < 1).all()  # clouds are centred first
 
 
 def test_poses_are_composed_with_their_gradient(generator):
     torch.manual_seed(0)
     network = PCRNetwork(32, iterations=3).train()
     source, target = torch.randn(2, 2, 20, 3, generator=generator)
-    found = network(source, target)
-    moved = rigid.apply(found.rotation, found.translation, source)
+    prediction = network(source, target)
+    moved = rigid.apply(prediction.rotation, prediction.translation, source)
     chamfer_loss(moved, target).backward()
     assert all(
         p.grad.isfinite().all() and p.grad.abs().sum() > 0 for p in network.pose.parameters()
     )
-    identity = found.rotation @ found.rotation.mT
+    identity = prediction.rotation @ prediction.rotation.mT
     torch.testing.assert_close(identity, torch.eye(3).expand_as(identity), atol=1e-5, rtol=0)
 
 

@@ -84,9 +84,9 @@ def test_rows_are_distributions_and_answers_agree_with_them(seed, n, m, d, dtype
     torch.testing.assert_close(prob.sum(-1), torch.ones(2, n, dtype=dtype))
     assert (prob.gather(2, c.argmax().unsqueeze(-1)).squeeze(-1) >= prob.amax(-1) - 1e-5).all()
     y = torch.randn(2, m, 3, generator=generator, dtype=dtype)
-    found, low, high = c.soft_target(y), y.amin(1, True), y.amax(1, True)
+    actual, low, high = c.soft_target(y), y.amin(1, True), y.amax(1, True)
     held = c.weight() > 1e-3
-    assert ((found >= low - 1e-3) & (found <= high + 1e-3))[held].all()
+    assert ((actual >= low - 1e-3) & (actual <= high + 1e-3))[held].all()
     index = torch.randint(-1, m + 1, (2, n), generator=generator)
     nll = c.nll(index)
     assert (nll >= -1e-4 * (1 + size**2)).all()
@@ -133,14 +133,14 @@ def test_pairs_are_what_their_settings_say(seed, n, keep, sampling, outliers, co
     rows = rng.normal(size=(2, 80, 6)).astype(np.float32) / 4
     clouds = CloudSet(rows, np.zeros(2, np.int64), ("thing",))
     try:
-        how = PairSettings(
+        settings = PairSettings(
             n, degrees, keep=keep, sampling=sampling, outliers=outliers, corrupted=corrupted
         )
     except CorrmatError:
         assert round(keep * n) < 3
         return
     keys = [Key(seed, 0, 0, i) for i in range(2)]
-    pairs, again = (make_pairs(clouds, range(2), keys, how) for _ in range(2))
+    pairs, again = (make_pairs(clouds, range(2), keys, settings) for _ in range(2))
     assert torch.equal(pairs.source, again.source)
     assert pairs.source.shape[1] == round(keep * n)
     assert pairs.target.shape[1] == (round(keep * n) if corrupted == "both" else n)
@@ -148,11 +148,11 @@ def test_pairs_are_what_their_settings_say(seed, n, keep, sampling, outliers, co
     eye = torch.eye(3).expand(2, 3, 3)
     torch.testing.assert_close(pairs.rotation @ pairs.rotation.mT, eye, atol=1e-5, rtol=0)
     assert (metrics.rotation_error_deg(pairs.rotation, eye) <= degrees + 1e-2).all()
-    known = pairs.match < pairs.target.shape[1]
+    matched = pairs.match < pairs.target.shape[1]
     moved = rigid.apply(pairs.rotation, pairs.translation, pairs.source[..., :3])
     nearest = torch.cdist(moved.double(), pairs.target[..., :3].double())
     at = nearest.gather(2, pairs.match.clamp_max(pairs.target.shape[1] - 1).unsqueeze(-1))
-    assert (at.squeeze(-1) <= nearest.amin(2) + 1e-4)[known].all()
+    assert (at.squeeze(-1) <= nearest.amin(2) + 1e-4)[matched].all()
 
 
 @given(seeds, st.integers(0, 60), st.sampled_from([1e-6, 1.0, 1e9]), st.floats(-1e7, 1e7))
@@ -161,14 +161,14 @@ def test_registration_gives_a_rigid_motion_or_the_projects_own_error(seed, n, sc
     rng = np.random.default_rng(seed)
     cloud = scale * (rng.normal(size=(n, 3)) * rng.choice([0.0, 1.0, 1.0], 3) + far)
     try:
-        found = register(cloud, cloud[::-1], model="icp")
+        result = register(cloud, cloud[::-1], model="icp")
     except CorrmatError:
         return
-    assert np.isfinite(found.transform).all()
-    rotation = found.transform[:3, :3]
+    assert np.isfinite(result.transform).all()
+    rotation = result.transform[:3, :3]
     assert np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
     assert np.linalg.det(rotation) > 0
-    assert 0 <= found.confidence <= 1
+    assert 0 <= result.confidence <= 1
 
 
 @given(seeds, st.integers(3, 200))
@@ -184,10 +184,10 @@ def test_the_order_of_a_cloud_is_its_own(seed, n):
 def _file(kind):
     rng = np.random.default_rng(0)
     points = rng.normal(size=(12, 3))
-    made = io.BytesIO()
+    buffer = io.BytesIO()
     if kind in (".npy", ".npz"):
-        (np.save if kind == ".npy" else np.savez)(made, points)
-        return made.getvalue()
+        (np.save if kind == ".npy" else np.savez)(buffer, points)
+        return buffer.getvalue()
     if kind in (".xyz", ".csv", ".txt"):
         return "\n".join(" ".join(map(str, row)) for row in points).encode()
     if kind == ".pcd":

@@ -22,8 +22,8 @@ def angle_deg(a, b):
 
 def test_the_best_motion_is_the_truth_among_seven_tenths_wrong(generator):
     rotation, translation, x, y = matches(generator)
-    found, shift, score = ransac(x, y, torch.ones(len(x)), 0.05, generator=generator)
-    assert angle_deg(found[0], rotation) < 1
+    estimate, shift, score = ransac(x, y, torch.ones(len(x)), 0.05, generator=generator)
+    assert angle_deg(estimate[0], rotation) < 1
     assert (shift[0] - translation).norm() < 0.02
     assert (score[:-1] >= score[1:]).all()
     assert score[0] > 3 * score[1]
@@ -31,12 +31,12 @@ def test_the_best_motion_is_the_truth_among_seven_tenths_wrong(generator):
 
 def test_motions_that_are_returned_differ(generator):
     _, _, x, y = matches(generator, wrong=0.9)
-    found, _, _ = ransac(x, y, torch.ones(len(x)), 0.1, generator=generator, count=5)
-    assert 1 < len(found) <= 5
-    for i in range(len(found)):
+    rotation, _, _ = ransac(x, y, torch.ones(len(x)), 0.1, generator=generator, count=5)
+    assert 1 < len(rotation) <= 5
+    for i in range(len(rotation)):
         for j in range(i):
-            assert angle_deg(found[i], found[j]) > 9.9
-    assert torch.allclose(torch.det(found), torch.ones(len(found), dtype=found.dtype))
+            assert angle_deg(rotation[i], rotation[j]) > 9.9
+    assert torch.allclose(torch.det(rotation), torch.ones(len(rotation), dtype=rotation.dtype))
 
 
 def test_weights_decide_between_two_motions(generator):
@@ -46,9 +46,9 @@ def test_weights_decide_between_two_motions(generator):
     y[100:] = x[100:] @ other.T
     weight = torch.ones(200)
     weight[100:] = 0.3
-    found, _, _ = ransac(x, y, weight, 0.05, generator=generator)
-    assert angle_deg(found[0], one) < 1
-    assert angle_deg(found[1], other) < 1
+    rotation, _, _ = ransac(x, y, weight, 0.05, generator=generator)
+    assert angle_deg(rotation[0], one) < 1
+    assert angle_deg(rotation[1], other) < 1
 
 
 def test_the_same_generator_gives_the_same_motions(generator):
@@ -62,8 +62,8 @@ def test_the_same_generator_gives_the_same_motions(generator):
 
 def test_matches_that_no_rigid_motion_explains_give_none(generator):
     x = torch.rand(30, 3, generator=generator)
-    found, shift, score = ransac(x, 10 * x, torch.ones(30), 0.01, generator=generator)
-    assert found.shape == (0, 3, 3)
+    rotation, shift, score = ransac(x, 10 * x, torch.ones(30), 0.01, generator=generator)
+    assert rotation.shape == (0, 3, 3)
     assert shift.shape == (0, 3)
     assert score.shape == (0,)
 
@@ -71,7 +71,7 @@ def test_matches_that_no_rigid_motion_explains_give_none(generator):
 def test_points_on_a_line_are_laid_on_each_other(generator):
     """How they turn about their line nobody can say; that they meet, everybody."""
     x = torch.rand(30, 1, generator=generator) * torch.tensor([1.0, 2.0, 3.0])
-    found, shift, score = ransac(x, x, torch.ones(30), 0.01, generator=generator)
-    moved = x.double() @ found[0].T + shift[0]
+    rotation, shift, score = ransac(x, x, torch.ones(30), 0.01, generator=generator)
+    moved = x.double() @ rotation[0].T + shift[0]
     torch.testing.assert_close(moved, x.double())
     assert score[0] > 29

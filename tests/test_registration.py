@@ -42,26 +42,26 @@ def angle_deg(a, b):
 
 def test_the_example_is_registered_within_two_degrees(pair):
     _, source, target, truth = pair
-    found = corrmat.register(source, target)
-    assert angle_deg(found.transform, truth) < 2
-    moved, right = (source @ t[:3, :3].T + t[:3, 3] for t in (found.transform, truth))
+    result = corrmat.register(source, target)
+    assert angle_deg(result.transform, truth) < 2
+    moved, right = (source @ t[:3, :3].T + t[:3, 3] for t in (result.transform, truth))
     assert np.linalg.norm(moved - right, axis=1).max() < 0.05 * example.MILLIMETRES
-    assert found.verdict == "aligned"
-    assert found.transform.dtype == np.float64
-    assert len(found.matches) == len(found.match_confidence) > 0
-    assert found.matches[:, 0].max() < len(source)
-    assert found.matches[:, 1].max() < len(target)
+    assert result.verdict == "aligned"
+    assert result.transform.dtype == np.float64
+    assert len(result.matches) == len(result.match_confidence) > 0
+    assert result.matches[:, 0].max() < len(source)
+    assert result.matches[:, 1].max() < len(target)
 
 
 def test_matches_name_the_users_rows(pair):
     """Most confident matches lie near each other after the true motion."""
     _, source, target, truth = pair
-    found = corrmat.register(source, target)
-    sure = found.matches[np.argsort(-found.match_confidence)[:20]]
+    result = corrmat.register(source, target)
+    sure = result.matches[np.argsort(-result.match_confidence)[:20]]
     moved = source[sure[:, 0]] @ truth[:3, :3].T + truth[:3, 3]
     off = np.linalg.norm(moved - target[sure[:, 1]], axis=1)
     assert np.median(off) < 0.2 * example.MILLIMETRES
-    assert 0.3 < found.match_agrees.mean() < 1
+    assert 0.3 < result.match_agrees.mean() < 1
 
 
 def test_the_order_of_rows_does_not_matter_and_the_seed_decides(pair):
@@ -85,9 +85,9 @@ def test_any_unit_and_place_gives_the_same_motion(pair):
     _, source, target, truth = pair
     near = corrmat.register(source, target)
     for factor, far in ((1e-3, 0.0), (1e3, 1e7)):
-        found = corrmat.register(factor * source + far, factor * target - far)
-        assert angle_deg(found.transform, truth) < 2
-        assert found.rmse == pytest.approx(factor * near.rmse, rel=0.2)
+        result = corrmat.register(factor * source + far, factor * target - far)
+        assert angle_deg(result.transform, truth) < 2
+        assert result.rmse == pytest.approx(factor * near.rmse, rel=0.2)
 
 
 def test_detail_far_from_the_origin_is_not_lost():
@@ -97,8 +97,8 @@ def test_detail_far_from_the_origin_is_not_lost():
     rotation = registration_rotation(rng)
     source = 1000 * points + 1e7
     target = (1000 * points) @ rotation.T - 1e7
-    found = corrmat.register(source, target)
-    moved = source @ found.transform[:3, :3].T + found.transform[:3, 3]
+    result = corrmat.register(source, target)
+    moved = source @ result.transform[:3, :3].T + result.transform[:3, 3]
     assert np.linalg.norm(moved - target, axis=1).max() < 1e-3
 
 
@@ -149,9 +149,9 @@ def test_unknown_options_are_refused(options, message):
 
 def test_small_clouds_are_registered_or_doubted():
     for cloud in (GRID[[0, 1, 4]], GRID[:5], GRID[[0, 1, 4, 16]]):
-        found = registration.register(cloud, cloud + 5)
-        assert np.isfinite(found.transform).all()
-        assert np.linalg.det(found.transform[:3, :3]) == pytest.approx(1)
+        result = registration.register(cloud, cloud + 5)
+        assert np.isfinite(result.transform).all()
+        assert np.linalg.det(result.transform[:3, :3]) == pytest.approx(1)
 
 
 def test_clouds_that_have_nothing_in_common_are_doubtful(pair):
@@ -162,11 +162,11 @@ def test_clouds_that_have_nothing_in_common_are_doubtful(pair):
 
 def test_many_points_are_subsampled_evenly():
     cloud = np.random.default_rng(0).normal(size=(100_000, 3))
-    found = registration.Cloud.of(cloud, "source", 0)
-    assert len(found.rows) == registration.FULL_POINTS
-    assert len(set(found.rows.tolist())) == registration.FULL_POINTS
-    assert np.abs(found.centre).max() < 0.03
-    assert abs(np.median(found.rows) - 50_000) < 1500  # from everywhere in the file
+    actual = registration.Cloud.of(cloud, "source", 0)
+    assert len(actual.rows) == registration.FULL_POINTS
+    assert len(set(actual.rows.tolist())) == registration.FULL_POINTS
+    assert np.abs(actual.centre).max() < 0.03
+    assert abs(np.median(actual.rows) - 50_000) < 1500  # from everywhere in the file
 
 
 def test_the_command_writes_what_it_promises(pair, tmp_path, capsys):
@@ -185,9 +185,11 @@ def test_the_command_writes_what_it_promises(pair, tmp_path, capsys):
         "agree with",
     ):
         assert word in shown
-    found = json.loads(result.read_text())
-    assert {"transform", "confidence", "rmse", "verdict", "model", "seed", "seconds"} <= set(found)
-    transform = np.array(found["transform"])
+    content = json.loads(result.read_text())
+    assert {"transform", "confidence", "rmse", "verdict", "model", "seed", "seconds"} <= set(
+        content
+    )
+    transform = np.array(content["transform"])
     assert angle_deg(transform, truth) < 2
     assert np.allclose(read_scan(out), source @ transform[:3, :3].T + transform[:3, 3])
     assert 1e6 < html.stat().st_size < 8e6
@@ -259,9 +261,9 @@ def test_the_authors_checkpoint_registers(pair):
     turn = np.array(
         [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
     )
-    found = corrmat.register(points, points @ turn.T, model=path)
-    assert found.model == str(path)
-    assert angle_deg(found.transform[:3, :3], turn) < 2
+    result = corrmat.register(points, points @ turn.T, model=path)
+    assert result.model == str(path)
+    assert angle_deg(result.transform[:3, :3], turn) < 2
 
 
 def test_shipped_weights_are_small_and_hold_no_pickle():
@@ -276,9 +278,9 @@ def test_shipped_weights_are_small_and_hold_no_pickle():
 def test_classical_pipelines_give_a_motion(pair, model):
     pytest.importorskip("open3d")
     _, source, target, _ = pair
-    found = corrmat.register(source, target, model=model)
-    assert found.transform.shape == (4, 4)
-    assert np.linalg.det(found.transform[:3, :3]) == pytest.approx(1, abs=1e-6)
+    result = corrmat.register(source, target, model=model)
+    assert result.transform.shape == (4, 4)
+    assert np.linalg.det(result.transform[:3, :3]) == pytest.approx(1, abs=1e-6)
 
 
 def test_without_open3d_the_classical_pipelines_say_what_to_install(pair, monkeypatch):

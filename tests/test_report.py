@@ -49,11 +49,11 @@ RECORD = {
 
 def test_the_table_has_ours_the_papers_and_both_ratios():
     heads, rows = tables.table(Record.from_json(RECORD))
-    found = {row[0]: row[1:] for row in rows}
+    entry = {row[0]: row[1:] for row in rows}
     assert heads[1:] == ["DCP", "DCP_corr", "ratio", "paper DCP", "paper DCP_corr", "paper ratio"]
-    assert found["correct matches, %"] == ["25.0", "50.0", "0.5", "5.5", "99.9", "0.0551"]
-    assert found["rotation RMSE (Euler), deg"] == ["30", "3", "10", "", "", ""]
-    assert "Chamfer distance (squared)" not in found  # not a number: not a row
+    assert entry["correct matches, %"] == ["25.0", "50.0", "0.5", "5.5", "99.9", "0.0551"]
+    assert entry["rotation RMSE (Euler), deg"] == ["30", "3", "10", "", "", ""]
+    assert "Chamfer distance (squared)" not in entry  # not a number: not a row
     shown = tables.terminal_table(Record.from_json(RECORD))
     assert "32 pairs in 1.5 min" in shown
     assert len({len(line) for line in shown.splitlines() if "%" in line or "deg" in line}) == 1
@@ -63,7 +63,7 @@ def test_a_test_in_bands_is_summed_up_by_the_mean_of_its_bands():
     """The paper gives 1.4 and 2.4 in bands alone, and prints their MAE."""
     bands = {"bands": [{"relative_euler_mae_deg": 1.0}, {"relative_euler_mae_deg": 3.0}]}
     paper = {"DCP": bands, "DCP_corr": {"bands": [{"relative_euler_mae_deg": 0.5}, {}]}}
-    arms = {arm: found | {"relative_euler_mae_deg": 7.0} for arm, found in RECORD["arms"].items()}
+    arms = {arm: entry | {"relative_euler_mae_deg": 7.0} for arm, entry in RECORD["arms"].items()}
     shown = tables.markdown_summary(
         [Record.from_json(RECORD | {"arms": arms, "bands_deg": [0, 9], "paper": paper})]
     )
@@ -99,7 +99,7 @@ def test_panels_show_training_bands_or_the_sweep():
 
     parts = [{"match_accuracy": 0.5, "relative_euler_mae_deg": 2.0, "relative_euler_rmse_deg": 3.0}]
     bands = {"bands": [{"band_deg": [0, 30]} | parts[0]]}
-    arms = {arm: found | bands for arm, found in RECORD["arms"].items()}
+    arms = {arm: entry | bands for arm, entry in RECORD["arms"].items()}
     shown = figures.panels(Record.from_json(RECORD | {"arms": arms, "paper": {"DCP": bands}}))
     assert [panel.title for panel in shown][1] == "rotation MAE (Euler), deg"
     assert [(c.arm, c.paper, c.x, c.y) for c in shown[1].series] == [
@@ -107,7 +107,7 @@ def test_panels_show_training_bands_or_the_sweep():
     ]  # fmt: skip
 
     sweep = {"sweep": [{"outliers": 0.4} | parts[0]]}
-    arms = {arm: found | sweep for arm, found in RECORD["arms"].items()}
+    arms = {arm: entry | sweep for arm, entry in RECORD["arms"].items()}
     shown = figures.panels(Record.from_json(RECORD | {"arms": arms}))
     assert [panel.xlabel for panel in shown][3:] == ["training pairs seen"] + [
         "outliers in the test, %"

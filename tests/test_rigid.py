@@ -39,11 +39,11 @@ def test_procrustes_recovers_the_motion(generator):
 def test_procrustes_agrees_with_scipy_on_noisy_weighted_points(generator):
     x, y = torch.randn(2, 6, 20, 3, generator=generator, dtype=torch.float64)
     w = torch.rand(6, 20, generator=generator, dtype=torch.float64)
-    found, _ = rigid.procrustes(x, y, w)
+    actual, _ = rigid.procrustes(x, y, w)
     for i in range(6):
         cx, cy = (w[i] @ x[i]) / w[i].sum(), (w[i] @ y[i]) / w[i].sum()
         expected, _ = Rotation.align_vectors((y[i] - cy).numpy(), (x[i] - cx).numpy(), w[i].numpy())
-        np.testing.assert_allclose(found[i], expected.as_matrix(), atol=1e-9)
+        np.testing.assert_allclose(actual[i], expected.as_matrix(), atol=1e-9)
 
 
 def test_procrustes_and_gradients_equal_the_loop_through_the_svd(generator):

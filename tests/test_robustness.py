@@ -41,8 +41,8 @@ def test_the_papers_chart_comes_out_of_it():
     """Matches: within 2.5 deg at 1024 points up to 90 %. The vector: within 10 deg everywhere."""
     for percent, paper in robustness.PAPER["matches"].items():
         if percent <= 90:
-            found = robustness.wrong_matches(robustness.SHOWN, percent, 200).mean()
-            assert abs(found - paper) < 2.5
+            actual = robustness.wrong_matches(robustness.SHOWN, percent, 200).mean()
+            assert abs(actual - paper) < 2.5
     for percent, paper in robustness.PAPER["rotation vector"].items():
         assert abs(robustness.wrong_vector(percent, 2000).mean() - paper) < 10
 
@@ -50,10 +50,10 @@ def test_the_papers_chart_comes_out_of_it():
 def test_the_command_writes_the_curve_and_the_picture(tmp_path, capsys):
     assert main(["robustness", "--scale", "smoke", "--results", str(tmp_path)]) == 0
     folder = tmp_path / "smoke" / "robustness"
-    found = json.loads((folder / "curve.json").read_text())
-    assert list(found["curves"]) == [
+    content = json.loads((folder / "curve.json").read_text())
+    assert list(content["curves"]) == [
         "64 points", "512 points", "1024 points", "4096 points", "rotation vector"
     ]  # fmt: skip
-    assert all(len(c["mean"]) == len(found["percent"]) for c in found["curves"].values())
+    assert all(len(c["mean"]) == len(content["percent"]) for c in content["curves"].values())
     assert (folder / "curve.png").read_bytes().startswith(b"\x89PNG")
     assert "rotation vector" in capsys.readouterr().out

@@ -32,12 +32,12 @@ def pair(generator, n=12, m=15):
 @pytest.mark.parametrize("loss", [CorrespondenceLoss, RegistrationLoss])
 def test_turns_shapes_and_finite_gradients(loss, generator):
     network, batch = small().train(), pair(generator)
-    found = network(batch.source, batch.target)
-    assert len(found.steps) == 2
+    prediction = network(batch.source, batch.target)
+    assert len(prediction.steps) == 2
     assert len(network.eval()(batch.source, batch.target).steps) == 5
-    assert found.steps[-1] is found
-    assert found.correspondence.prob().shape == (2, 12, 15)
-    loss().loss(found, batch).backward()
+    assert prediction.steps[-1] is prediction
+    assert prediction.correspondence.prob().shape == (2, 12, 15)
+    loss().loss(prediction, batch).backward()
     assert all(p.grad is not None and p.grad.isfinite().all() for p in network.parameters())
 
 
@@ -52,8 +52,8 @@ def test_targets_features_are_computed_once(generator, monkeypatch):
 def test_a_turn_does_not_see_the_gradient_of_the_turn_before(generator):
     """The source is moved by the detached transform."""
     network, batch = small().train(), pair(generator)
-    found = network(batch.source, batch.target)
-    first, second = found.steps
+    prediction = network(batch.source, batch.target)
+    first, second = prediction.steps
     leaves = torch.autograd.grad(
         second.correspondence.beta.sum(), first.rotation, allow_unused=True
     )
@@ -66,13 +66,14 @@ def test_where_the_clouds_lie_together_does_not_matter(generator):
     network = small().eval()
     network.embed.edge[0].weight.data[:, :6] = 0  # leave pair features only
     with torch.no_grad():
-        found = network(batch.source, batch.target)
+        prediction = network(batch.source, batch.target)
         turn = random_rotation(2, generator).float()
         source = torch.cat([batch.source[..., i : i + 3] @ turn.mT for i in (0, 3)], -1)
-        beta = found.steps[0].correspondence.beta
+        beta = prediction.steps[0].correspondence.beta
         again = network(source, batch.target)
     torch.testing.assert_close(
-        again.steps[0].correspondence.feature_source, found.steps[0].correspondence.feature_source,
+        again.steps[0].correspondence.feature_source,
+        prediction.steps[0].correspondence.feature_source,
         atol=1e-4, rtol=1e-4,
     )  # fmt: skip
     assert not torch.equal(again.steps[0].correspondence.beta, beta)
@@ -135,8 +136,8 @@ def test_rpmnet_overfits_eight_pairs(method):
         adam.step()
     module.eval()
     with torch.no_grad():
-        found = module(batch.source, batch.target)
-    assert rotation_error_deg(found.rotation, batch.rotation).median() < 2
+        prediction = module(batch.source, batch.target)
+    assert rotation_error_deg(prediction.rotation, batch.rotation).median() < 2
     if method is RPMNetCorr:
-        hits = match_accuracy(found.correspondence.argmax(), batch.match, 64)
+        hits = match_accuracy(prediction.correspondence.argmax(), batch.match, 64)
         assert hits.mean() > 0.9

@@ -31,31 +31,31 @@ def write(path, points=POINTS):
 
 @pytest.mark.parametrize("kind", [".ply", *CLOUDS])
 def test_every_cloud_format_gives_its_points(tmp_path, kind):
-    found = read_scan(write(tmp_path / f"cloud{kind}"))
-    assert found.dtype == np.float64
-    assert np.abs(found - POINTS).max() < (1e-4 if kind == ".pcd" else 1e-12)
+    scan = read_scan(write(tmp_path / f"cloud{kind}"))
+    assert scan.dtype == np.float64
+    assert np.abs(scan - POINTS).max() < (1e-4 if kind == ".pcd" else 1e-12)
 
 
 @pytest.mark.parametrize("kind", MESHES)
 def test_a_mesh_is_sampled_evenly_and_by_seed(tmp_path, kind):
     path = tmp_path / f"box{kind}"
-    made = trimesh.creation.box((2, 2, 2)).export(file_type=kind[1:])
-    for name, content in made.items() if kind == ".gltf" else [(path.name, made)]:
+    actual = trimesh.creation.box((2, 2, 2)).export(file_type=kind[1:])
+    for name, content in actual.items() if kind == ".gltf" else [(path.name, actual)]:
         name = path.name if name == "model.gltf" else name
         (tmp_path / name).write_bytes(content.encode() if isinstance(content, str) else content)
-    found = read_scan(path, seed=1)
-    assert found.shape == (20_000, 3)
-    assert np.allclose(np.abs(found).max(1), 1, atol=1e-6)  # all on the surface
-    assert np.abs(found.mean(0)).max() < 0.03
-    assert (read_scan(path, seed=1) == found).all()
-    assert (read_scan(path, seed=2) != found).any()
+    scan = read_scan(path, seed=1)
+    assert scan.shape == (20_000, 3)
+    assert np.allclose(np.abs(scan).max(1), 1, atol=1e-6)  # all on the surface
+    assert np.abs(scan.mean(0)).max() < 0.03
+    assert (read_scan(path, seed=1) == scan).all()
+    assert (read_scan(path, seed=2) != scan).any()
 
 
 def test_parts_of_a_scene_are_merged(tmp_path):
     boxes = [trimesh.creation.box((1, 1, 1)).apply_translation((x, 0, 0)) for x in (0, 10)]
     trimesh.Scene(boxes).export(tmp_path / "scene.glb")
-    found = read_scan(tmp_path / "scene.glb")
-    assert abs((found[:, 0] > 5).mean() - 0.5) < 0.02
+    scan = read_scan(tmp_path / "scene.glb")
+    assert abs((scan[:, 0] > 5).mean() - 0.5) < 0.02
 
 
 def test_an_xyz_file_may_begin_with_its_count_and_carry_more_columns(tmp_path):
@@ -103,9 +103,9 @@ def test_bad_files_are_one_clear_error(tmp_path, name, content, message):
     path = tmp_path / name
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(CorrmatError, match=message) as found:
+    with pytest.raises(CorrmatError, match=message) as caught:
         read_scan(path)
-    assert "\n" not in str(found.value)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("kind", [".ply", ".pcd", ".npy", ".npz", ".glb"])

@@ -12,15 +12,15 @@ from corrmat.data.shapes.families import FAMILIES
 @pytest.mark.parametrize("name", FAMILIES)
 def test_every_family_makes_different_sound_shapes(name):
     label = list(FAMILIES).index(name)
-    made = [shapes.make_shape(("train", label + turn * len(FAMILIES))) for turn in range(2)]
-    for rows, found in made:
-        assert found == label
+    shapes_made = [shapes.make_shape(("train", label + turn * len(FAMILIES))) for turn in range(2)]
+    for rows, family in shapes_made:
+        assert family == label
         assert rows.shape == (2048, 6)
         assert rows.dtype == np.float32
         np.testing.assert_allclose(np.linalg.norm(rows[:, 3:], axis=1), 1, atol=1e-5)
         np.testing.assert_allclose(rows[:, :3].mean(0), 0, atol=1e-5)
         assert np.linalg.norm(rows[:, :3], axis=1).max() == pytest.approx(1, abs=1e-5)
-    assert np.abs(made[0][0] - made[1][0]).max() > 0.1
+    assert np.abs(shapes_made[0][0] - shapes_made[1][0]).max() > 0.1
 
 
 def test_there_are_forty_families_and_splits_differ():

@@ -35,12 +35,12 @@ def test_slices_equal_the_matrix_in_value_and_gradient(size, outlier, generator,
     a, b, v, last = vectors(generator, outlier)
     inputs = [a, b] if last is None else [a, b, last.requires_grad_()]
     pull = torch.randn(2, 7, 4, generator=generator, dtype=torch.float64)
-    found = []
+    results = []
     for way in (softmax_rows, dense):
         total, mean = way(a, b, v, last)
         value = (torch.cat([total.unsqueeze(-1), mean], -1) * pull).sum()
-        found.append([total, mean, *torch.autograd.grad(value, inputs)])
-    for fast, naive in zip(*found, strict=True):
+        results.append([total, mean, *torch.autograd.grad(value, inputs)])
+    for fast, naive in zip(*results, strict=True):
         torch.testing.assert_close(fast, naive)
     scores = a @ b.mT if last is None else torch.cat([a @ b.mT, last.unsqueeze(-1)], -1)
     assert (argmax_rows(a, b, last) == scores.argmax(2)).all()

@@ -95,12 +95,12 @@ def sinkhorn_padded(affinity: Tensor, iterations: int, slack: str) -> Tensor:
 
 def within_radius_loops(points: Tensor, radius: float, k: int) -> Tensor:
     """Neighbours of lowest index, point by point."""
-    found = []
+    neighbors = []
     for cloud in points:
         for i, x in enumerate(cloud):
             near = [j for j, y in enumerate(cloud) if j != i and (x - y).norm() <= radius]
-            found.append((near + [i] * k)[:k])
-    return torch.tensor(found).view(*points.shape[:2], k)
+            neighbors.append((near + [i] * k)[:k])
+    return torch.tensor(neighbors).view(*points.shape[:2], k)
 
 
 def chamfer_loss_dense(moved: Tensor, target: Tensor) -> Tensor:
@@ -113,10 +113,10 @@ def ball_query_by_sorting(points: Tensor, radius: float, k: int) -> Tensor:
     """Neighbours of lowest index from a sorted (B, N, N) array of indices, as released."""
     n = points.shape[1]
     away = torch.cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist") > radius
-    own = torch.arange(n)
-    away[:, own, own] = True
-    index = own.repeat(len(points), n, 1).masked_fill(away, n).sort(-1).values[..., :k]
-    return torch.where(index == n, own.view(1, n, 1), index)
+    self_index = torch.arange(n)
+    away[:, self_index, self_index] = True
+    index = self_index.repeat(len(points), n, 1).masked_fill(away, n).sort(-1).values[..., :k]
+    return torch.where(index == n, self_index.view(1, n, 1), index)
 
 
 def released_dcp(network: DCPNetwork, source: Tensor, target: Tensor) -> tuple[Tensor, ...]:
