@@ -38,7 +38,7 @@ class LayerOutput(NamedTuple):
     """Output of `linear_relu_max`."""
 
     edges: Tensor | None  # (B, P, K, O) activations, if kept
-    pooled: Tensor  # (B, P, O) maximum over the neighbours
+    pooled: Tensor | None  # (B, P, O) maximum over the neighbours, if asked for
     moments: Moments | None  # of the activations, if gathered
 
 
@@ -79,6 +79,7 @@ def batch_norm_edge_mlp(
             _track(norm, mean[0], variance[0], edges.shape[0] * edges.shape[1])
         layer, more = fold_norm(linear, norm, mean, variance), index < len(linears)
         output = linear_relu_max(activations, layer, keep=more, gather=training and more)
+        assert output.pooled is not None
         pooled.append(output.pooled[0])
         if output.edges is not None:
             activations, input_moments = output.edges, output.moments
@@ -93,14 +94,15 @@ def group_norm_edge_mlp(edges: Tensor, mlp: nn.Sequential) -> Tensor:
         mlp: 1 x 1 convolution, group norm and ReLU a layer, as `networks.pointnet.shared_mlp`.
     """
     layers = list(zip(mlp[::3], mlp[1::3], strict=True))
-    output = LayerOutput(edges, edges, moments(edges.detach()))
+    output = LayerOutput(edges, None, moments(edges.detach()))
     for index, (linear, norm) in enumerate(layers, 1):
         assert isinstance(linear, nn.Conv1d)
         assert isinstance(norm, nn.GroupNorm)
         assert output.edges is not None
         assert output.moments is not None
         layer, more = _fold_group_norm(linear, norm, output.moments), index < len(layers)
-        output = linear_relu_max(output.edges, layer, keep=more, gather=more)
+        output = linear_relu_max(output.edges, layer, keep=more, pool=not more, gather=more)
+    assert output.pooled is not None
     return output.pooled
 
 
@@ -169,7 +171,7 @@ def _track(norm: nn.BatchNorm1d, mean: Tensor, variance: Tensor, count: int) -> 
 
 
 def linear_relu_max(
-    edges: Tensor, layer: FusedLinear, *, keep: bool, gather: bool = False
+    edges: Tensor, layer: FusedLinear, *, keep: bool, pool: bool = True, gather: bool = False
 ) -> LayerOutput:
     """Compute relu(edges @ weight.T + bias) and its maximum over the neighbours.
 
@@ -178,14 +180,15 @@ def linear_relu_max(
     Args:
         edges: (B, P, K, I).
         layer: one for each sample.
-        keep: whether to return the activations besides their maximum.
+        keep: whether to return the activations.
+        pool: whether to return their maximum.
         gather: whether to return their moments as well; needs `keep`.
     """
     device = edges.device.type
     if torch.is_autocast_enabled(device):
         edges = edges.to(torch.get_autocast_dtype(device))
     weight, bias = layer.weight.to(edges.dtype), layer.bias.to(edges.dtype)
-    out, pooled, total, second = _LinearReluMax.apply(edges, weight, bias, keep, gather)
+    out, pooled, total, second = _LinearReluMax.apply(edges, weight, bias, keep, pool, gather)
     count = edges.shape[1] * edges.shape[2]
     return LayerOutput(out, pooled, _moments_from_sums(total, second, count) if gather else None)
 
@@ -210,16 +213,25 @@ class _LinearReluMax(torch.autograd.Function):
     """`linear_relu_max` slab by slab, forward and backward."""
 
     @staticmethod
-    def forward(ctx, edges: Tensor, weight: Tensor, bias: Tensor, keep: bool, gather: bool):  # noqa: ANN001, ANN205
+    def forward(  # noqa: ANN205
+        ctx,  # noqa: ANN001
+        edges: Tensor,
+        weight: Tensor,
+        bias: Tensor,
+        keep: bool,
+        pool: bool,
+        gather: bool,
+    ):
         """Compute outputs, maxima and moments slab by slab; save only what backward reads."""
         ctx.set_materialize_grads(False)
         batch, points, k, _ = edges.shape
         size = max(1, _SLAB_ROWS // k)
         shape = (k, weight.shape[1])
         out = edges.new_empty(batch, points, *shape) if keep else None
-        pooled = edges.new_empty(batch, points, shape[1])
-        needs_argmax = any(ctx.needs_input_grad)
-        argmax = torch.empty_like(pooled, dtype=torch.int16) if needs_argmax else None
+        pooled = edges.new_empty(batch, points, shape[1]) if pool else None
+        argmax = None
+        if pooled is not None and any(ctx.needs_input_grad):
+            argmax = torch.empty_like(pooled, dtype=torch.int16)
         positions = torch.arange(k, dtype=torch.float32, device=edges.device).unsqueeze(-1)
         scratch, marks = edges.new_empty(size, *shape), positions.new_empty(size, *shape)
         total = _at_least_float32(bias).new_zeros(batch, shape[1]) if gather else None
@@ -229,8 +241,9 @@ class _LinearReluMax(torch.autograd.Function):
             active = scratch[:size_here] if out is None else out[b, part]
             flat = active.view(-1, shape[1])
             torch.addmm(bias[b], edges[b, part].flatten(0, 1), weight[b].mT, out=flat).relu_()
-            torch.amax(active, 1, out=pooled[b, part])
-            if argmax is not None:
+            if pooled is not None:
+                torch.amax(active, 1, out=pooled[b, part])
+            if pooled is not None and argmax is not None:
                 # As numbers: torch's maximum with indices takes several times as long.
                 torch.eq(active, pooled[b, part].unsqueeze(1), out=marks[:size_here]).mul_(
                     positions
@@ -278,4 +291,11 @@ class _LinearReluMax(torch.autograd.Function):
             grad_bias[b] += flat.sum(0)
             if grad_edges is not None:
                 torch.mm(flat, weight[b], out=grad_edges[b, part].flatten(0, 1))
-        return grad_edges, grad_weight.mT.to(weight.dtype), grad_bias.to(weight.dtype), None, None
+        return (
+            grad_edges,
+            grad_weight.mT.to(weight.dtype),
+            grad_bias.to(weight.dtype),
+            None,
+            None,
+            None,
+        )

@@ -100,7 +100,11 @@ def _bench_row(row: dict[str, float | str]) -> str:
         time = f"{row['gflops']} GFLOP/s" if "gflops" in row else ""
     else:
         time = f"{float(ms):.3g}" if float(ms) < 100 else f"{float(ms):,.0f}"
-    ratios = [f"{v} x ({k.removesuffix('_ratio')})" for k, v in row.items() if "_ratio" in k]
+    ratios = [
+        f"{value} x ({name.removesuffix('_ratio').replace('_', ' ')})"
+        for name, value in row.items()
+        if name.endswith("_ratio")
+    ]
     if "released_peak_mb" in row:
         ratios.append(f"{row['released_peak_mb']} MB")
     share = f"{float(row['peak_share']):.0%}" if "peak_share" in row else ""
