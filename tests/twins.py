@@ -176,14 +176,18 @@ def released_rpmnet(
         f_x = embed(moved, source[..., 3:] @ rotation.mT)
         f_y = embed(y, target[..., 3:])
         beta, alpha = network.annealing(moved, y)
-        distance = (f_x.unsqueeze(2) - f_y.unsqueeze(1)).square().sum(-1)
-        affinity = -beta[:, None, None] * (distance - alpha[:, None, None])
+        affinity = -beta[:, None, None] * (square_distance(f_x, f_y) - alpha[:, None, None])
         c = sinkhorn_padded(affinity, network.sinkhorn_iterations, network.slack).exp()
         weight = c.sum(2)
         matched = c @ y / weight.unsqueeze(2)
         rotation, translation = procrustes_loop(x, matched, weight)
         matrices.append(c)
     return rotation, translation, matrices
+
+
+def square_distance(x: Tensor, y: Tensor) -> Tensor:
+    """|x_i - y_j|^2 of (B, N, d) and (B, M, d), by products: no (B, N, M, d) array."""
+    return x.square().sum(2, keepdim=True) - 2 * x @ y.mT + y.square().sum(2).unsqueeze(1)
 
 
 def one_hot_loss(c: Tensor, match: Tensor) -> Tensor:
@@ -202,18 +206,14 @@ def pointnet(points: Tensor, network: torch.nn.Module) -> Tensor:
             case torch.nn.BatchNorm1d():
                 x = batch_norm(x, layer)
             case _:
-                x = x.clamp_min(0)
+                x = F.relu(x)
     return x.mT
 
 
 def batch_norm(x: Tensor, layer: torch.nn.BatchNorm1d) -> Tensor:
-    """Batch norm of (B, C, ...) by its formula; running statistics are not updated."""
-    over = [0, *range(2, x.dim())]
-    mean = x.mean(over) if layer.training else layer.running_mean
-    var = x.var(over, correction=0) if layer.training else layer.running_var
-    shape = (-1, *[1] * (x.dim() - 2))
-    gain = layer.weight / (var + layer.eps).sqrt()
-    return (x - mean.view(shape)) * gain.view(shape) + layer.bias.view(shape)
+    """Batch norm of (B, C, ...); running statistics are not updated."""
+    stats = (None, None) if layer.training else (layer.running_mean, layer.running_var)
+    return F.batch_norm(x, *stats, layer.weight, layer.bias, layer.training, eps=layer.eps)
 
 
 def released_pcrnet(network: PCRNetwork, source: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
