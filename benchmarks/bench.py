@@ -17,6 +17,7 @@ import logging
 import multiprocessing
 import resource
 import statistics
+import subprocess
 import sys
 import tempfile
 import time
@@ -50,7 +51,10 @@ from corrmat.ops import streaming  # noqa: E402
 from corrmat.ops.correspondence import SinkhornCorrespondence, SoftCorrespondence  # noqa: E402
 from corrmat.ops.neighbors import within_radius  # noqa: E402
 from corrmat.ops.rigid import procrustes  # noqa: E402
+from corrmat.registration.benchmark import frozen_pairs  # noqa: E402
+from corrmat.registration.example import write_example  # noqa: E402
 from corrmat.registration.hypotheses import CLASSICAL  # noqa: E402
+from corrmat.registration.register import register  # noqa: E402
 from corrmat.training.fit import fresh_method  # noqa: E402
 from corrmat.training.hardware import keep_freed_memory  # noqa: E402
 from corrmat.training.preflight import prepare  # noqa: E402
@@ -71,6 +75,7 @@ STEPS: tuple[tuple[str, dict[str, Any], int, int], ...] = (
     ("PCRNet_corr", {}, 100, 32),
     ("PCRNet_corr", {}, 1024, 32),
     ("PCRNet", {}, 100, 8),
+    ("Invariant_corr", {}, 358, 8),
 )
 COMPILED = (STEPS[0], STEPS[6])
 POINTS = (256, 512, 1024, 2048, 4096, 8192, 12288, 16384)
@@ -112,6 +117,8 @@ def main() -> None:
     for method in ("DCP_corr", "RPMNet_corr", "PCRNet_corr"):
         add(f"one pair through {method}, N=1024", in_a_process(inference, method))
     add("one pair through FPFH + RANSAC, N=1024", in_a_process(classical, "ransac"))
+    add("corrmat.register, two clouds of 1,024 points", in_a_process(registered_pair))
+    add("corrmat register, the example, from a cold start", in_a_process(cold_start))
     for name in TWINS:
         add(f"{name}, value and gradient", in_a_process(against_twin, name))
     for n in (512, 2048, 8192):
@@ -297,6 +304,30 @@ def classical(name: str) -> Row:
         return {"ms": round(1e3 * median([lambda: CLASSICAL[name](source, target, 0)], 5)[0], 1)}
     except CorrmatError as error:
         return {"not_measured": str(error)}
+
+
+def registered_pair() -> Row:
+    """Milliseconds of `corrmat.register` on `real` pairs: overlap, noise, outliers."""
+    pairs = frozen_pairs("real", "shapes", 1024, None, 12)
+    clouds = zip(pairs.source.double().numpy(), pairs.target.double().numpy(), strict=True)
+    works = [lambda x=x[:, :3], y=y[:, :3]: register(x, y) for x, y in clouds]
+    return {"ms": round(1e3 * statistics.median(median(works, 3)), 1)}
+
+
+def cold_start() -> Row:
+    """Milliseconds of the whole command, imports included, and of importing torch alone."""
+    with tempfile.TemporaryDirectory() as folder:
+        write_example(Path(folder))
+        scans = [str(Path(folder, f"{name}.ply")) for name in ("source", "target")]
+        commands = ["-m", "corrmat", "register", *scans], ["-c", "import torch"]
+        works = [
+            lambda words=words: subprocess.run(
+                [sys.executable, *words], check=True, stdout=subprocess.DEVNULL
+            )
+            for words in commands
+        ]
+        ours, torch_alone = median(works, 5)
+    return {"ms": round(1e3 * ours), "import_torch_ms": round(1e3 * torch_alone)}
 
 
 def against_twin(name: str) -> Row:

@@ -75,12 +75,15 @@ def test_dgcnn_gives_the_same_with_and_without_the_fused_kernel(monkeypatch, gen
         torch.testing.assert_close(fused, plain, rtol=1e-8, atol=1e-9)
 
 
-@pytest.mark.parametrize("slab", [1, 7, 8192])
+@pytest.mark.parametrize("slab", [1, 700, 2**20])
 def test_folded_group_norm_equals_the_plain_network(slab, monkeypatch, generator):
     """Values and gradients, however the edges are cut into slabs."""
-    monkeypatch.setattr(edge_mlp, "_SLAB_ROWS", slab)
+    monkeypatch.setattr(edge_mlp, "_SLAB_VALUES", slab)
     torch.manual_seed(0)
     network = NeighborhoodNet(16).double()
+    for norm in network.edge[1::3]:
+        norm.weight.data = torch.linspace(-1, 2, len(norm.weight)).double()
+        norm.bias.data = torch.linspace(-0.5, 0.5, len(norm.bias)).double()
     cloud = torch.randn(2, 9, 6, dtype=torch.float64, generator=generator)
     local = neighborhoods(cloud, 1.5, 5)
     pull = torch.randn(2, 9, 16, dtype=torch.float64, generator=generator)
@@ -91,6 +94,21 @@ def test_folded_group_norm_equals_the_plain_network(slab, monkeypatch, generator
         results.append([value, *(p.grad.clone() for p in network.parameters())])
     for fast, naive in zip(*results, strict=True):
         torch.testing.assert_close(fast, naive, rtol=1e-8, atol=1e-9)
+
+
+@pytest.mark.parametrize("slab", [1, 100, 2**20])
+def test_the_maximum_of_a_linear_layer_equals_the_plain_one(slab, monkeypatch, generator):
+    monkeypatch.setattr(edge_mlp, "_SLAB_VALUES", slab)
+    torch.manual_seed(0)
+    linear = torch.nn.Linear(6, 11).double()
+    rows = torch.randn(3, 20, 6, dtype=torch.float64, generator=generator).requires_grad_()
+    pull = torch.randn(3, 11, dtype=torch.float64, generator=generator)
+    results = []
+    for value in (edge_mlp.linear_max(rows, linear), linear(rows).amax(1)):
+        leaves = (rows, linear.weight, linear.bias)
+        results.append([value, *torch.autograd.grad((value * pull).sum(), leaves)])
+    for fast, naive in zip(*results, strict=True):
+        torch.testing.assert_close(fast, naive, rtol=1e-12, atol=1e-12)
 
 
 def test_ties_give_their_gradient_once():

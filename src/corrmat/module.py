@@ -58,6 +58,7 @@ class RegistrationModule(L.LightningModule):
         super().__init__()
         self.network = network
         self.optimizer_settings = optimizer
+        self._last_loss: Tensor | None = None
         # Synchronised by hand: a test runs in one process, even after a distributed training.
         self.metrics = RegistrationMetrics(sync_on_compute=False)
 
@@ -73,25 +74,41 @@ class RegistrationModule(L.LightningModule):
         return self.network(source, target)
 
     def training_step(self, batch: PairBatch, batch_index: int) -> Tensor:
-        """Compute the loss of a batch and log it.
+        """Compute the loss of a batch; log it and the correct matches where Lightning logs.
 
         Raises:
-            CorrmatError: the loss is not finite.
+            CorrmatError: the loss is not finite. A GPU has to be waited for to know this, so that
+                it is only asked at the steps that are logged, and before each validation.
         """
         prediction = self(batch.source, batch.target)
         loss = self.loss(prediction, batch)
-        if not torch.isfinite(loss):
-            raise CorrmatError(
-                f"the loss is {loss.item()} at step {self.global_step} (epoch "
-                f"{self.current_epoch}, batch {batch_index}, shapes {batch.shape.tolist()}); "
-                "lower --optimizer.lr or clip gradients"
-            )
+        self._last_loss = loss.detach()
+        is_logged = self._is_logged_step()
+        if is_logged or loss.device.type == "cpu":
+            self._require_finite_loss(f"batch {batch_index}, shapes {batch.shape.tolist()}")
         self.log("train/loss", loss, prog_bar=True, batch_size=len(batch))
-        if prediction.correspondence is not None:
+        if is_logged and prediction.correspondence is not None:
             predicted = prediction.correspondence.argmax()
             accuracy = match_accuracy(predicted, batch.match, batch.target.shape[1])
             self.log("train/matches", accuracy.mean().float(), prog_bar=True, batch_size=len(batch))
         return loss
+
+    def _is_logged_step(self) -> bool:
+        """Tell whether Lightning writes what this step logs; without a Trainer, every step."""
+        every = getattr(self._trainer, "log_every_n_steps", 1)
+        return every < 2 or (self.global_step + 1) % every == 0
+
+    def _require_finite_loss(self, where: str) -> None:
+        """Reject a last loss that is not finite."""
+        if self._last_loss is not None and not torch.isfinite(self._last_loss):
+            raise CorrmatError(
+                f"the loss is {self._last_loss.item()} at step {self.global_step} (epoch "
+                f"{self.current_epoch}, {where}); lower --optimizer.lr or clip gradients"
+            )
+
+    def on_validation_start(self) -> None:
+        """Check the last loss, so that no checkpoint keeps weights that are not finite."""
+        self._require_finite_loss("before validation")
 
     def validation_step(self, batch: PairBatch, batch_index: int) -> None:
         """Collect the predictions of a batch."""

@@ -1,12 +1,18 @@
-"""Read and write point clouds and meshes in the usual file formats."""
+"""Read and write point clouds and meshes in the usual file formats.
+
+Each reader is imported on first use: together they take longer than a registration.
+"""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 
 from corrmat.errors import CorrmatError
 from corrmat.files import replace_bytes
+
+if TYPE_CHECKING:
+    import trimesh
 
 MESHES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
 CLOUDS = (".pcd", ".xyz", ".txt", ".csv", ".npy", ".npz")
@@ -35,7 +41,7 @@ def read_scan(path: Path, seed: int = 0) -> np.ndarray:
         raise CorrmatError(f"{path}: no such file")
     if not path.stat().st_size:
         raise CorrmatError(f"{path} is empty")
-    reader = {".pcd": _pcd, ".npy": _numpy, ".npz": _numpy}.get(kind)
+    reader = {".ply": _ply, ".pcd": _pcd, ".npy": _numpy, ".npz": _numpy}.get(kind)
     reader = reader or (_scene if kind in MESHES else _text)
     try:
         points = reader(path, seed)
@@ -73,7 +79,7 @@ def write_ply(path: Path, points: np.ndarray) -> None:
     replace_bytes(path, "\n".join(header).encode() + points.astype("<f8").tobytes())
 
 
-def read_mesh(path: Path) -> trimesh.Trimesh | None:
+def read_mesh(path: Path) -> "trimesh.Trimesh | None":
     """Read a mesh file as one mesh; None if it holds points without faces.
 
     Raises:
@@ -87,12 +93,16 @@ def read_mesh(path: Path) -> trimesh.Trimesh | None:
 
 def _load_parts(path: Path) -> list[object]:
     """Load a file with trimesh and return the parts of its scene."""
+    import trimesh
+
     loaded = trimesh.load(path)
     return list(loaded.dump()) if isinstance(loaded, trimesh.Scene) else [loaded]
 
 
-def _merge_meshes(parts: list[object]) -> trimesh.Trimesh | None:
+def _merge_meshes(parts: list[object]) -> "trimesh.Trimesh | None":
     """Merge the meshes with an area among the parts of a scene; None if there is none."""
+    import trimesh
+
     meshes = [p for p in parts if isinstance(p, trimesh.Trimesh) and len(p.faces) and p.area > 0]
     if not meshes:
         return None
@@ -108,6 +118,8 @@ def _unreadable(path: Path, error: Exception) -> CorrmatError:
 
 def _scene(path: Path, seed: int) -> np.ndarray:
     """Sample the meshes of a file, or return its points if it has no faces."""
+    import trimesh
+
     parts = _load_parts(path)
     mesh = _merge_meshes(parts)
     if mesh is not None:
@@ -115,6 +127,18 @@ def _scene(path: Path, seed: int) -> np.ndarray:
     clouds = (trimesh.PointCloud, trimesh.Trimesh)
     points = [np.asarray(p.vertices) for p in parts if isinstance(p, clouds)]
     return np.concatenate([p.reshape(-1, 3) for p in points]) if points else np.empty((0, 3))
+
+
+def _ply(path: Path, seed: int) -> np.ndarray:
+    """Return the vertices of a PLY file without faces; sample one with faces as a mesh."""
+    from plyfile import PlyData
+
+    content = PlyData.read(path)
+    names = [element.name for element in content.elements if element.count]
+    if "vertex" not in names or len(names) > 1:
+        return _scene(path, seed)
+    vertices = content["vertex"]
+    return np.stack([np.asarray(vertices[axis], np.float64) for axis in "xyz"], 1)
 
 
 def _pcd(path: Path, seed: int) -> np.ndarray:

@@ -48,11 +48,11 @@ class PCRNetwork(nn.Module):
         x, y = source[..., :3], target[..., :3]
         centre_x, centre_y = x.mean(1), y.mean(1)
         x, y = x - centre_x.unsqueeze(1), y - centre_y.unsqueeze(1)
-        f_y = self.embed(y).amax(1)
+        f_y = self.embed.pooled(y)
         moved, steps = x, []
         transform = rigid.identity(x)
         for _ in range(self.iterations):
-            pose = self.pose(torch.cat([f_y, self.embed(moved).amax(1)], 1)).to(x.dtype)
+            pose = self.pose(torch.cat([f_y, self.embed.pooled(moved)], 1)).to(x.dtype)
             update = quaternion_to_matrix(pose[:, :4]), pose[:, 4:]
             moved, transform = rigid.apply(*update, moved), rigid.compose(update, transform)
             # From centred clouds back to the original coordinates.

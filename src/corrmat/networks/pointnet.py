@@ -2,7 +2,10 @@
 
 from collections.abc import Callable, Sequence
 
+import torch.nn.functional as F
 from torch import Tensor, nn
+
+from corrmat.ops.edge_mlp import linear_max
 
 Norm = Callable[[int], nn.Module]
 
@@ -44,3 +47,13 @@ class PointNet(nn.Module):
     def forward(self, points: Tensor) -> Tensor:
         """Map points (B, N, 3) to features (B, N, width)."""
         return self.layers(points.flatten(0, 1)).unflatten(0, points.shape[:2])
+
+    def pooled(self, points: Tensor) -> Tensor:
+        """Compute the maximum of the features over a cloud's points: (B, N, 3) to (B, width).
+
+        Only for a network without norms.
+        """
+        narrow, widest = self.layers[:-2], self.layers[-2]
+        assert isinstance(widest, nn.Linear)
+        features = narrow(points.flatten(0, 1)).unflatten(0, points.shape[:2])
+        return F.relu(linear_max(features, widest))

@@ -56,15 +56,21 @@ def point_pair_features(offset: Tensor, normal: Tensor, neighbor_normal: Tensor)
     Returns:
         (..., 4).
     """
-    normal = normal.expand_as(neighbor_normal)
-    to_offset = _angle_rad(normal, offset), _angle_rad(neighbor_normal, offset)
-    between, distance = _angle_rad(normal, neighbor_normal), offset.norm(dim=-1)
-    return torch.stack([*to_offset, between, distance], -1)
+    d, n_r, n_i = _coordinates_first(offset, normal, neighbor_normal)
+    angles = _angle_rad(n_r, d), _angle_rad(n_i, d), _angle_rad(n_r, n_i)
+    return torch.stack([*angles, d.square().sum(0).sqrt()], -1)
+
+
+def _coordinates_first(*vectors: Tensor) -> list[Tensor]:
+    """Move coordinates to the front: sums over a last dimension of three are slow."""
+    return [vector.movedim(-1, 0).contiguous() for vector in vectors]
 
 
 def _angle_rad(a: Tensor, b: Tensor) -> Tensor:
-    cross, dot = torch.linalg.cross(a, b), (a * b).sum(-1)
-    return torch.atan2(cross.norm(dim=-1), dot)
+    """Compute the angles between vectors (3, ...); 0 where one of them is zero."""
+    cross = torch.linalg.cross(*torch.broadcast_tensors(a, b), dim=0)
+    # The sum turns a dot product of -0, whose angle would be pi, into 0.
+    return torch.atan2(cross.square().sum(0).sqrt(), (a * b).sum(0))
 
 
 SIGNLESS = 13  # features of `signless_pair_features`
@@ -87,8 +93,7 @@ def signless_pair_features(offset: Tensor, normal: Tensor, neighbor_normal: Tens
     Returns:
         (..., 13), each of order one.
     """
-    # Coordinates first: sums over a last dimension of three are several times slower.
-    x, n, m = (t.movedim(-1, 0).contiguous() for t in (offset, normal, neighbor_normal))
+    x, n, m = _coordinates_first(offset, normal, neighbor_normal)
     distance = x.square().sum(0).sqrt().clamp_min(1e-6)
     d = x / distance
     a, b, c = (n * d).sum(0), (m * d).sum(0), (n * m).sum(0)

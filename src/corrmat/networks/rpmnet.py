@@ -118,6 +118,7 @@ class AnnealingNet(nn.Module):
     def forward(self, source: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
         """Map clouds (B, N, 3) and (B, M, 3) in one frame to positive beta (B,) and alpha (B,)."""
         flagged = torch.cat([F.pad(source, (0, 1), value=0.0), F.pad(target, (0, 1), value=1.0)], 1)
-        pooled = self.pooled(self.point(flagged.mT).amax(2))
+        # All points are the neighbours of one: the maximum over the clouds.
+        pooled = self.pooled(group_norm_edge_mlp(flagged.unsqueeze(1), self.point).squeeze(1))
         beta, alpha = F.softplus(pooled).unbind(1)
         return beta, alpha

@@ -262,7 +262,8 @@ def outlier_feature(feature_target: Tensor, b: float = -1.0) -> Tensor:
     # The ridge selects the solution of smallest norm, and zero for features of zero.
     ridge = 1e-9 * gram.diagonal(dim1=1, dim2=2).mean(1)[:, None, None] + 1e-12
     eye = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
-    solution = torch.linalg.solve(gram + ridge * eye, f.sum(1))
+    # Without a check for errors, for which a GPU would have to wait: the ridge keeps it solvable.
+    solution = torch.linalg.solve_ex(gram + ridge * eye, f.sum(1).unsqueeze(2)).result.squeeze(2)
     return (b * solution).to(_at_least_float32(feature_target).dtype)
 
 

@@ -1,45 +1,43 @@
 """Fused edge MLP: linear layers, norms and ReLU on the edges of a neighbour graph, max-pooled.
 
 A cloud of P points with K neighbours each has P * K edges, tens of times more rows than points. In
-a plain implementation the norm, ReLU and maximum each pass over all of them. Here a norm needs no
-pass: the mean and covariance of a linear layer's output follow from those of its input, so the
-norm is folded into the weights before the matrix product. The input moments of the next layer are
-accumulated slab by slab while a slab is in cache. The last layer's activations are never stored.
+a plain implementation the norm, the ReLU and the maximum each pass over all of them. Here a layer
+stores its output before the norm, and the next layer applies norm and ReLU when it reads a slab of
+edges that fits in the cache. The norm's statistics are summed while the slab is there.
+
+Norm and ReLU keep the order of a channel's values (or reverse it), so the maximum is taken before
+them, and the last layer's edges are never stored. Their gradient has two parts, both cheap: few
+edges win a maximum, and the statistics' gradient is an affine function of the layer's input.
 
 `batch_norm_edge_mlp` and `group_norm_edge_mlp` are drop-ins for the plain layers; their twins are
 in tests/twins.py, and `make bench` shows where they pay.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
-_SLAB_ROWS = 8192  # edges processed together
+_SLAB_VALUES = 2**20  # values of the edges that are processed together, on a CPU
+_GPU_SLAB_VALUES = 2**27
 _MIN_EDGES = 2**15  # below, the plain layers of DGCNN are as fast
 
+Linear = nn.Linear | nn.Conv1d
+Norm = nn.BatchNorm1d | nn.GroupNorm
 
-class Moments(NamedTuple):
-    """Mean (B, C) and covariance (B, C, C) of the edges of each of B samples, in float64."""
+
+_Slab = tuple[slice, slice]  # samples and points
+_Pooled = tuple[Tensor, Tensor]
+
+
+class Statistics(NamedTuple):
+    """Mean and variance (B, C) of the channels of B samples, in float64."""
 
     mean: Tensor
-    covariance: Tensor
-
-
-class FusedLinear(NamedTuple):
-    """Weight (B, O, I) and bias (B, O) of a linear layer with its norm folded in, per sample."""
-
-    weight: Tensor
-    bias: Tensor
-
-
-class LayerOutput(NamedTuple):
-    """Output of `linear_relu_max`."""
-
-    edges: Tensor | None  # (B, P, K, O) activations, if kept
-    pooled: Tensor | None  # (B, P, O) maximum over the neighbours, if asked for
-    moments: Moments | None  # of the activations, if gathered
+    variance: Tensor
 
 
 def is_worthwhile(edges: Tensor) -> bool:
@@ -68,193 +66,179 @@ def batch_norm_edge_mlp(
     Returns:
         The maximum over the neighbours after each layer, (P, O) each.
     """
-    activations = edges.unsqueeze(0)
-    input_moments = moments(activations) if training else None
-    pooled = []
-    for index, (linear, norm) in enumerate(zip(linears, norms, strict=True), 1):
-        if input_moments is None:
-            mean, variance = _running_statistics(norm)
-        else:
-            mean, variance = output_moments(linear, input_moments)
-            _track(norm, mean[0], variance[0], edges.shape[0] * edges.shape[1])
-        layer, more = fold_norm(linear, norm, mean, variance), index < len(linears)
-        output = linear_relu_max(activations, layer, keep=more, gather=training and more)
-        assert output.pooled is not None
-        pooled.append(output.pooled[0])
-        if output.edges is not None:
-            activations, input_moments = output.edges, output.moments
-    return pooled
+
+    def statistics_of(norm: nn.BatchNorm1d, channels: Statistics | None) -> Statistics:
+        if channels is None:
+            return _running_statistics(norm)
+        _track(norm, channels, edges.shape[0] * edges.shape[1])
+        return channels
+
+    layers = list(zip(linears, norms, strict=True))
+    pooled = _edge_mlp(edges.unsqueeze(0), layers, statistics_of, gather=training, pool_all=True)
+    return [features[0] for features in pooled]
 
 
 def group_norm_edge_mlp(edges: Tensor, mlp: nn.Sequential) -> Tensor:
     """Apply a shared MLP with group norms to edges (B, P, K, I) and max-pool: (B, P, O).
 
     Args:
-        edges: no gradient flows to their moments.
+        edges: K edges of each point, at most 32,767.
         mlp: 1 x 1 convolution, group norm and ReLU a layer, as `networks.pointnet.shared_mlp`.
     """
+
+    def statistics_of(norm: nn.GroupNorm, channels: Statistics | None) -> Statistics:
+        assert channels is not None
+        return _group_statistics(channels, norm.num_groups)
+
     layers = list(zip(mlp[::3], mlp[1::3], strict=True))
-    output = LayerOutput(edges, None, moments(edges.detach()))
-    for index, (linear, norm) in enumerate(layers, 1):
-        assert isinstance(linear, nn.Conv1d)
-        assert isinstance(norm, nn.GroupNorm)
-        assert output.edges is not None
-        assert output.moments is not None
-        layer, more = _fold_group_norm(linear, norm, output.moments), index < len(layers)
-        output = linear_relu_max(output.edges, layer, keep=more, pool=not more, gather=more)
-    assert output.pooled is not None
-    return output.pooled
+    return _edge_mlp(edges, layers, statistics_of, gather=True, pool_all=False)[0]
 
 
-def moments(edges: Tensor) -> Moments:
-    """Compute the moments of edges (B, P, K, C)."""
-    with torch.autocast(edges.device.type, enabled=False):
-        flat = _at_least_float32(edges.flatten(1, 2))
-        return _moments_from_sums(flat.sum(1), flat.mT @ flat, flat.shape[1])
+def linear_max(rows: Tensor, linear: nn.Linear) -> Tensor:
+    """Compute the maximum of a linear layer's output over the rows: (B, N, I) to (B, O).
+
+    Equal to `linear(rows).amax(1)`, but of equal maxima one gets the gradient. N is at most 32,767.
+    """
+    device = rows.device.type
+    if torch.is_autocast_enabled(device):
+        rows = rows.to(torch.get_autocast_dtype(device))
+    weight, bias = (t.to(rows.dtype) for t in (linear.weight, linear.bias))
+    _, pooled, _, _ = _Layer.apply(
+        rows.unsqueeze(1), None, None, weight, bias, False, True, False
+    )  # fmt: skip
+    return pooled.squeeze(1)
 
 
-def output_moments(linear: nn.Linear | nn.Conv1d, input_moments: Moments) -> tuple[Tensor, Tensor]:
-    """Compute mean and variance (B, O) of a linear layer's output from its input's moments."""
-    weight = linear.weight.view(len(linear.weight), -1).double()
-    mean = input_moments.mean @ weight.mT + (0 if linear.bias is None else linear.bias.double())
-    return mean, ((weight @ input_moments.covariance) * weight).sum(-1).clamp_min(0)
-
-
-def fold_norm(
-    linear: nn.Linear | nn.Conv1d,
-    norm: nn.BatchNorm1d | nn.GroupNorm,
-    mean: Tensor,
-    variance: Tensor,
-) -> FusedLinear:
-    """Fold the norm that follows a linear layer into its weight and bias.
+def _edge_mlp(
+    edges: Tensor,
+    layers: Sequence[tuple[nn.Module, nn.Module]],
+    statistics_of: Callable[..., Statistics],
+    *,
+    gather: bool,
+    pool_all: bool,
+) -> list[Tensor]:
+    """Apply layers to edges (B, P, K, I); return the maxima (B, P, O) of the last or of all.
 
     Args:
-        linear: weight (O, I) or (O, I, 1), bias (O,) or None.
-        norm: gain and shift (O,) and the epsilon.
-        mean: (B, O) that the norm subtracts from the layer's output.
-        variance: (B, O) by whose root it divides.
+        edges: of B samples.
+        layers: the linear layer and the norm of each.
+        statistics_of: which statistics a norm uses, from those of the channels if gathered.
+        gather: whether to gather the statistics of the channels.
+        pool_all: whether to pool after every layer.
     """
-    scale = norm.weight * torch.rsqrt(variance + norm.eps)
-    bias = 0 if linear.bias is None else linear.bias.double()
-    weight = linear.weight.view(len(linear.weight), -1).double()
-    return FusedLinear(scale.unsqueeze(-1) * weight, scale * (bias - mean) + norm.bias)
+    device = edges.device.type
+    if torch.is_autocast_enabled(device):
+        edges = edges.to(torch.get_autocast_dtype(device))
+    count = edges.shape[1] * edges.shape[2]
+    scale, shift, maxima = None, None, []
+    for index, (linear, norm) in enumerate(layers, 1):
+        assert isinstance(linear, Linear)
+        assert isinstance(norm, Norm)
+        more = index < len(layers)
+        # A negative gain makes a channel's smallest value its largest: the layer is negated there.
+        sign = torch.where(norm.weight < 0, -1.0, 1.0).to(norm.weight.dtype)
+        weight = sign.unsqueeze(1) * linear.weight.flatten(1)
+        bias = torch.zeros_like(sign) if linear.bias is None else sign * linear.bias
+        edges, pooled, total, square = _Layer.apply(
+            edges, scale, shift, weight.to(edges.dtype), bias.to(edges.dtype),
+            more, pool_all or not more, gather,
+        )  # fmt: skip
+        channels = None
+        if gather:
+            mean = total / count
+            channels = Statistics(sign * mean, (square / count - mean.square()).clamp_min(0))
+        mean, variance = statistics_of(norm, channels)
+        gain = norm.weight * torch.rsqrt(variance + norm.eps)
+        scale, shift = sign * gain, norm.bias - gain * mean
+        if pooled is not None:
+            dtype = pooled.dtype
+            normed = pooled * scale.unsqueeze(1).to(dtype) + shift.unsqueeze(1).to(dtype)
+            maxima.append(F.relu(normed))
+    return maxima
 
 
-def _fold_group_norm(linear: nn.Conv1d, norm: nn.GroupNorm, input_moments: Moments) -> FusedLinear:
-    """Fold a group norm: its statistics are those of a group's channels together."""
-    per_channel = output_moments(linear, input_moments)
-    mean, variance = (t.unflatten(-1, (norm.num_groups, -1)) for t in per_channel)
+def _group_statistics(channels: Statistics, groups: int) -> Statistics:
+    """Compute the statistics of a group's channels together, repeated for each channel."""
+    mean, variance = (t.unflatten(-1, (groups, -1)) for t in channels)
     group_mean = mean.mean(-1, keepdim=True)
     group_variance = (variance + (mean - group_mean).square()).mean(-1, keepdim=True)
-    statistics = (t.expand_as(mean).flatten(1) for t in (group_mean, group_variance))
-    return fold_norm(linear, norm, *statistics)
+    return Statistics(*(t.expand_as(mean).flatten(1) for t in (group_mean, group_variance)))
 
 
-def _running_statistics(norm: nn.BatchNorm1d) -> tuple[Tensor, Tensor]:
-    """Return a batch norm's running mean and variance, (1, O) float64."""
+def _running_statistics(norm: nn.BatchNorm1d) -> Statistics:
+    """Return a batch norm's running mean and variance, (1, C)."""
     assert norm.running_mean is not None
     assert norm.running_var is not None
-    return norm.running_mean.double()[None], norm.running_var.double()[None]
+    return Statistics(norm.running_mean.double()[None], norm.running_var.double()[None])
 
 
 @torch.no_grad()
-def _track(norm: nn.BatchNorm1d, mean: Tensor, variance: Tensor, count: int) -> None:
+def _track(norm: nn.BatchNorm1d, statistics: Statistics, count: int) -> None:
     """Update running statistics as torch's batch norm does."""
     assert norm.running_mean is not None
     assert norm.running_var is not None
     assert norm.num_batches_tracked is not None
     assert norm.momentum is not None
     norm.num_batches_tracked.add_(1)
-    norm.running_mean.lerp_(mean.to(norm.running_mean.dtype), norm.momentum)
-    unbiased = variance * (count / max(count - 1, 1))
+    norm.running_mean.lerp_(statistics.mean[0].to(norm.running_mean.dtype), norm.momentum)
+    unbiased = statistics.variance[0] * (count / max(count - 1, 1))
     norm.running_var.lerp_(unbiased.to(norm.running_var.dtype), norm.momentum)
 
 
-def linear_relu_max(
-    edges: Tensor, layer: FusedLinear, *, keep: bool, pool: bool = True, gather: bool = False
-) -> LayerOutput:
-    """Compute relu(edges @ weight.T + bias) and its maximum over the neighbours.
+class _Layer(torch.autograd.Function):
+    """A linear layer on relu(edges * scale + shift), slab by slab, forward and backward.
 
-    Of equal maxima one gets the gradient.
+    Inputs:
+        edges: (B, P, K, I), the output of the layer before, or the network's input.
+        scale, shift: (B, I), the norm of the layer before; None for the network's input.
+        weight, bias: (O, I) and (O,).
+        keep, pool, gather: which outputs are asked for; the others are None.
 
-    Args:
-        edges: (B, P, K, I).
-        layer: one for each sample.
-        keep: whether to return the activations.
-        pool: whether to return their maximum.
-        gather: whether to return their moments as well; needs `keep`.
+    Outputs:
+        z (B, P, K, O), before its own norm; its maximum over the neighbours (B, P, O), of equal
+        values the last gets the gradient; the sums of z and of z^2, (B, O) float64.
     """
-    device = edges.device.type
-    if torch.is_autocast_enabled(device):
-        edges = edges.to(torch.get_autocast_dtype(device))
-    weight, bias = layer.weight.to(edges.dtype), layer.bias.to(edges.dtype)
-    out, pooled, total, second = _LinearReluMax.apply(edges, weight, bias, keep, pool, gather)
-    count = edges.shape[1] * edges.shape[2]
-    return LayerOutput(out, pooled, _moments_from_sums(total, second, count) if gather else None)
-
-
-def _moments_from_sums(total: Tensor, second: Tensor, count: int) -> Moments:
-    """Compute moments from sums (B, C) and sums of outer products (B, C, C)."""
-    mean = total.double() / count
-    return Moments(mean, second.double() / count - mean.unsqueeze(-1) * mean.unsqueeze(-2))
-
-
-def _at_least_float32(edges: Tensor) -> Tensor:
-    return edges if edges.dtype == torch.float64 else edges.float()
-
-
-def _slabs(batch: int, points: int, size: int) -> list[tuple[int, slice]]:
-    """Split a batch into slabs: sample by sample, `size` points at a time."""
-    starts = range(0, points, size)
-    return [(b, slice(at, min(at + size, points))) for b in range(batch) for at in starts]
-
-
-class _LinearReluMax(torch.autograd.Function):
-    """`linear_relu_max` slab by slab, forward and backward."""
 
     @staticmethod
     def forward(  # noqa: ANN205
         ctx,  # noqa: ANN001
         edges: Tensor,
+        scale: Tensor | None,
+        shift: Tensor | None,
         weight: Tensor,
         bias: Tensor,
         keep: bool,
         pool: bool,
         gather: bool,
     ):
-        """Compute outputs, maxima and moments slab by slab; save only what backward reads."""
+        """Compute outputs, maxima and sums slab by slab; save what backward reads."""
         ctx.set_materialize_grads(False)
-        batch, points, k, _ = edges.shape
-        size = max(1, _SLAB_ROWS // k)
-        shape = (k, weight.shape[1])
-        out = edges.new_empty(batch, points, *shape) if keep else None
-        pooled = edges.new_empty(batch, points, shape[1]) if pool else None
-        argmax = None
-        if pooled is not None and any(ctx.needs_input_grad):
-            argmax = torch.empty_like(pooled, dtype=torch.int16)
-        positions = torch.arange(k, dtype=torch.float32, device=edges.device).unsqueeze(-1)
-        scratch, marks = edges.new_empty(size, *shape), positions.new_empty(size, *shape)
-        total = _at_least_float32(bias).new_zeros(batch, shape[1]) if gather else None
-        second = _at_least_float32(bias).new_zeros(batch, shape[1], shape[1]) if gather else None
-        for b, part in _slabs(batch, points, size):
-            size_here = part.stop - part.start
-            active = scratch[:size_here] if out is None else out[b, part]
-            flat = active.view(-1, shape[1])
-            torch.addmm(bias[b], edges[b, part].flatten(0, 1), weight[b].mT, out=flat).relu_()
-            if pooled is not None:
-                torch.amax(active, 1, out=pooled[b, part])
-            if pooled is not None and argmax is not None:
+        (batch, points, k, _), outputs = edges.shape, len(weight)
+        out = edges.new_empty(batch, points, k, outputs) if keep else None
+        pooled = edges.new_empty(batch, points, outputs) if pool else None
+        winner = edges.new_empty(batch, points, outputs, dtype=torch.int16) if pool else None
+        total = edges.new_zeros(batch, outputs, dtype=torch.float64) if gather else None
+        square = torch.zeros_like(total) if total is not None else None
+        wide, scratch, norm = _wide(edges), _Scratch(edges), _as_slabs(edges, scale, shift)
+        place = torch.arange(k, dtype=wide, device=edges.device).unsqueeze(-1)
+        for slab in _slabs(edges, outputs):
+            x = _active(edges, norm, slab, scratch)
+            shape = *x.shape[:3], outputs
+            z = scratch("z", shape) if out is None else out[slab]
+            torch.addmm(bias, x.flatten(0, 2), weight.mT, out=z.view(-1, outputs))
+            if total is not None and square is not None:
+                rows = z.flatten(1, 2).to(wide)
+                total[slab[0]] += rows.sum(1)
+                squares = torch.mul(rows, rows, out=scratch("wide", rows.shape, wide))
+                square[slab[0]] += squares.sum(1)
+            if pooled is not None and winner is not None:
+                pooled[slab] = z.amax(2)
                 # As numbers: torch's maximum with indices takes several times as long.
-                torch.eq(active, pooled[b, part].unsqueeze(1), out=marks[:size_here]).mul_(
-                    positions
-                )
-                argmax[b, part] = marks[:size_here].amax(1).to(argmax.dtype)
-            if total is not None and second is not None:
-                flat_wide = _at_least_float32(flat)
-                total[b] += flat_wide.sum(0)
-                second[b].addmm_(flat_wide.mT, flat_wide)
-        ctx.save_for_backward(edges, weight, out, pooled, argmax)
-        return out, pooled, total, second
+                wins = scratch("wide", shape, wide)
+                torch.eq(z, pooled[slab].unsqueeze(2), out=wins).mul_(place)
+                winner[slab] = wins.amax(2).to(winner.dtype)
+        ctx.save_for_backward(edges, scale, shift, weight, bias, out, winner)
+        return out, pooled, total, square
 
     @staticmethod
     def backward(  # noqa: ANN205
@@ -262,40 +246,209 @@ class _LinearReluMax(torch.autograd.Function):
         grad_out: Tensor | None,
         grad_pooled: Tensor | None,
         grad_total: Tensor | None,
-        grad_second: Tensor | None,
+        grad_square: Tensor | None,
     ):
-        """Compute the gradients of edges, weight and bias; each slab is computed again."""
-        edges, weight, out, pooled, argmax = ctx.saved_tensors
-        batch, points, k, _ = edges.shape
-        size, outputs = max(1, _SLAB_ROWS // k), weight.shape[1]
+        """Compute the gradients slab by slab; activations are computed again."""
+        edges, scale, shift, weight, bias, out, winner = ctx.saved_tensors
         grad_edges = torch.empty_like(edges) if ctx.needs_input_grad[0] else None
+        grad_scale = None if scale is None else torch.zeros_like(scale)
+        grad_shift = None if shift is None else torch.zeros_like(shift)
+        if out is not None and grad_out is None:
+            grad_out = torch.zeros_like(out)
+        scratch, norm = _Scratch(edges), _as_slabs(edges, scale, shift)
+        gradient = _LinearGradient(weight, bias, len(edges), grad_total, grad_square)
+        for slab in _slabs(edges, len(weight)):
+            samples, x = slab[0], _active(edges, norm, slab, scratch)
+            grad_x = None if grad_edges is None else grad_edges[slab]
+            pooled = None if grad_pooled is None else (winner[slab], grad_pooled[slab])
+            if out is None:
+                gradient.from_maximum(x, pooled, samples, grad_x)
+            else:
+                # In place: the next layer made this gradient, and nobody else reads it.
+                assert grad_out is not None
+                gradient.from_output(x, out[slab], grad_out[slab], pooled, samples, grad_x)
+            if grad_x is not None and grad_scale is not None and grad_shift is not None:
+                assert norm is not None
+                torch.ops.aten.threshold_backward.grad_input(grad_x, x, 0, grad_input=grad_x)
+                grad_shift[samples] += grad_x.flatten(1, 2).sum(1)
+                torch.mul(grad_x, edges[slab], out=x)
+                grad_scale[samples] += x.flatten(1, 2).sum(1)
+                grad_x *= norm[0][samples]
+        count = edges.shape[1] * edges.shape[2] if out is None else 0
+        return grad_edges, grad_scale, grad_shift, *gradient.of_parameters(count), None, None, None
+
+
+class _LinearGradient:
+    """Gradients of z = x W^T + b, by x slab by slab, and by W and b at the end.
+
+    The sums of z and of z^2 have a gradient as well. By z it is `slope * z + offset`, with slope
+    and offset (B, O), so it can be had without z: by x it is affine in x, and by W and b it
+    follows from the sums of x and of x x^T.
+    """
+
+    def __init__(
+        self,
+        weight: Tensor,
+        bias: Tensor,
+        samples: int,
+        grad_total: Tensor | None,
+        grad_square: Tensor | None,
+    ) -> None:
+        (outputs, inputs), wide = weight.shape, _wide(weight)
+        self.weight = weight
         # Inputs first: a product with few columns takes several times as long as its transpose.
-        grad_weight = torch.zeros_like(_at_least_float32(weight.mT))
-        grad_bias = torch.zeros_like(grad_weight[:, 0])
-        grad_pooled = None if grad_pooled is None else grad_pooled * (pooled > 0)
-        grad_outer = None if grad_second is None else (grad_second + grad_second.mT).to(edges.dtype)
-        scratch = edges.new_empty(size, k, outputs)
-        for b, part in _slabs(batch, points, size):
-            grad = scratch[: part.stop - part.start]
-            flat = grad.view(-1, outputs)
-            grad.zero_() if grad_out is None else grad.copy_(grad_out[b, part])
-            if grad_pooled is not None:
-                winners = argmax[b, part].long().unsqueeze(1)
-                grad.scatter_add_(1, winners, grad_pooled[b, part].unsqueeze(1))
-            if out is not None:
-                active = out[b, part].flatten(0, 1)
-                if grad_outer is not None and grad_total is not None:
-                    flat.addmm_(active, grad_outer[b]).add_(grad_total[b])
-                torch.ops.aten.threshold_backward.grad_input(flat, active, 0, grad_input=flat)
-            grad_weight[b] += edges[b, part].flatten(0, 1).mT @ flat
-            grad_bias[b] += flat.sum(0)
-            if grad_edges is not None:
-                torch.mm(flat, weight[b], out=grad_edges[b, part].flatten(0, 1))
-        return (
-            grad_edges,
-            grad_weight.mT.to(weight.dtype),
-            grad_bias.to(weight.dtype),
-            None,
-            None,
-            None,
-        )
+        self.by_weight = weight.new_zeros(inputs, outputs, dtype=wide)
+        self.by_bias = weight.new_zeros(outputs, dtype=wide)
+        self.slope = self.offset = self.broadcast = None
+        if grad_total is not None and grad_square is not None:
+            self.slope, self.offset = 2 * grad_square, grad_total
+            self.broadcast = _as_slabs(weight, self.slope, self.offset)
+            w = weight.double()
+            self.matrix = ((w.mT * self.slope.unsqueeze(1)) @ w).to(weight.dtype)  # (B, I, I)
+            self.constant = self.slope * bias.double() + self.offset  # (B, O)
+            self.vector = (self.constant @ w).to(weight.dtype)  # (B, I)
+            self.sum_x = weight.new_zeros(samples, inputs, dtype=wide)
+            self.sum_xx = weight.new_zeros(samples, inputs, inputs, dtype=wide)
+
+    def from_output(
+        self,
+        x: Tensor,
+        z: Tensor,
+        grad: Tensor,
+        pooled: _Pooled | None,
+        b: slice,
+        by_x: Tensor | None,
+    ) -> None:
+        """Compute the gradient of x from that of z, which is overwritten.
+
+        Args:
+            x: (b, p, K, I) of a slab.
+            z: (b, p, K, O).
+            grad: (b, p, K, O), gradient of z.
+            pooled: winners and gradient of the maximum over the neighbours, (b, p, O) each.
+            b: samples of the slab.
+            by_x: (b, p, K, I), where the gradient of x is written; None if nobody asks for it.
+        """
+        if self.broadcast is not None:
+            slope, offset = (value[b] for value in self.broadcast)
+            grad.addcmul_(z, slope).add_(offset)
+        if pooled is not None:
+            winner, grad_pooled = (t.unsqueeze(2) for t in pooled)
+            grad.scatter_add_(2, winner.long(), grad_pooled)
+        rows = grad.flatten(0, 2)
+        self.by_weight += x.flatten(0, 2).mT @ rows
+        self.by_bias += rows.sum(0)
+        if by_x is not None:
+            torch.mm(rows, self.weight, out=by_x.flatten(0, 2))
+
+    def from_maximum(
+        self, x: Tensor, pooled: _Pooled | None, b: slice, by_x: Tensor | None
+    ) -> None:
+        """Compute the gradient of x where z is only pooled and summed; see `from_output`."""
+        rows, grad = x.flatten(1, 2), None if by_x is None else by_x.flatten(1, 2)
+        if self.slope is not None:
+            self.sum_x[b] += rows.sum(1)
+            self.sum_xx[b] += rows.mT @ rows
+            if grad is not None:
+                torch.baddbmm(self.vector[b].unsqueeze(1), rows, self.matrix[b], out=grad)
+        elif grad is not None:
+            grad.zero_()
+        if pooled is not None:
+            winner, grad_pooled = (t.flatten(0, 1) for t in pooled)  # (n, O)
+            self.by_bias += grad_pooled.sum(0)
+            k, rows = x.shape[2], x.flatten(0, 2)
+            start = torch.arange(0, len(rows), k, dtype=torch.int32, device=x.device).unsqueeze(1)
+            # By W: every channel sums the rows that won it. By x: every row sums the weights of
+            # the channels that it won. Sorted by winner, the channels of a row are neighbours.
+            bounds = torch.arange(0, winner.numel() + 1, len(winner), device=x.device)
+            index = (start + winner).mT.flatten()
+            self.by_weight += _bag_sums(rows, index, bounds, grad_pooled.mT).mT
+            if grad is None:
+                return
+            winner, channel = winner.sort(1)
+            each_row = torch.arange(len(rows) + 1, device=x.device)
+            bounds = torch.searchsorted((start + winner).flatten(), each_row)
+            weights = grad_pooled.gather(1, channel)
+            grad += _bag_sums(self.weight, channel.flatten(), bounds, weights).view_as(grad)
+
+    def of_parameters(self, count: int) -> tuple[Tensor, Tensor]:
+        """Return the gradients of W (O, I) and b (O,), after all slabs.
+
+        Args:
+            count: edges of a sample that `from_maximum` has seen.
+        """
+        by_weight, by_bias = self.by_weight.mT.double(), self.by_bias.double()
+        if count and self.slope is not None:
+            w, sum_x, sum_xx = (t.double() for t in (self.weight, self.sum_x, self.sum_xx))
+            slope = self.slope.unsqueeze(2)
+            by_weight = by_weight + (slope * (w @ sum_xx)).sum(0) + self.constant.mT @ sum_x
+            by_bias = by_bias + (self.slope * (sum_x @ w.mT) + count * self.constant).sum(0)
+        return by_weight.to(self.weight.dtype), by_bias.to(self.weight.dtype)
+
+
+def _bag_sums(rows: Tensor, index: Tensor, bounds: Tensor, weights: Tensor) -> Tensor:
+    """Sum weighted rows in bags: bag i has the entries from bounds[i] to bounds[i + 1].
+
+    Args:
+        rows: (n, C).
+        index: (E,) which row each entry is.
+        bounds: (bags + 1,).
+        weights: E weights.
+
+    Returns:
+        (bags, C).
+    """
+    return F.embedding_bag(
+        index.int(), rows, bounds.int(), mode="sum",
+        per_sample_weights=weights.flatten(), include_last_offset=True,
+    )  # fmt: skip
+
+
+class _Scratch:
+    """Memory that every slab uses again, so that it stays in the cache; the first is largest."""
+
+    def __init__(self, like: Tensor) -> None:
+        self._like = like
+        self._buffers: dict[str, Tensor] = {}
+
+    def __call__(self, name: str, shape: Sequence[int], dtype: torch.dtype | None = None) -> Tensor:
+        """Return a tensor of this shape, with the content of its last use."""
+        size = math.prod(shape)
+        if name not in self._buffers:
+            self._buffers[name] = self._like.new_empty(size, dtype=dtype or self._like.dtype)
+        return self._buffers[name][:size].view(shape)
+
+
+def _slabs(edges: Tensor, outputs: int) -> list[_Slab]:
+    """Split edges (B, P, K, I) into slabs: some whole samples, or some points of one sample."""
+    batch, points, k, inputs = edges.shape
+    values = _GPU_SLAB_VALUES if edges.is_cuda else _SLAB_VALUES
+    size = max(1, values // (k * max(inputs, outputs)))  # points of a slab
+    samples = max(1, size // points)
+    return [
+        (slice(b, min(b + samples, batch)), slice(p, min(p + size, points)))
+        for b in range(0, batch, samples)
+        for p in range(0, points, size)
+    ]
+
+
+def _as_slabs(like: Tensor, *values: Tensor | None) -> tuple[Tensor, ...] | None:
+    """Shape values (B, C) so that they broadcast over a slab; None if there are none."""
+    present = [value[:, None, None].to(like.dtype) for value in values if value is not None]
+    return tuple(present) or None
+
+
+def _active(
+    edges: Tensor, norm: tuple[Tensor, ...] | None, slab: _Slab, scratch: _Scratch
+) -> Tensor:
+    """Apply norm and ReLU of the layer before to a slab of its output: (b, p, K, I)."""
+    values = edges[slab]
+    if norm is None:
+        return values
+    scale, shift = (value[slab[0]] for value in norm)
+    return torch.addcmul(shift, values, scale, out=scratch("x", values.shape)).relu_()
+
+
+def _wide(values: Tensor) -> torch.dtype:
+    """Return the format for sums of these values: float32, or float64 for float64."""
+    return torch.promote_types(values.dtype, torch.float32)

@@ -48,15 +48,16 @@ def within_radius(points: Tensor, radius: float, k: int) -> Tensor:
         (B, N, k) int64, ascending; unused places hold the point's own index.
     """
     batch, n, _ = points.shape
-    all_points = torch.arange(n, device=points.device)
-    neighbors = all_points.view(1, n, 1).repeat(batch, 1, k)
-    for part in all_points.split(max(1, _CHUNK // max(1, batch * n))):
-        near = torch.cdist(points[:, part], points, compute_mode=_EXACT) <= radius
-        near[:, torch.arange(len(part)), part] = False
-        rank = near.cumsum(-1, dtype=torch.int32)
-        b, i, j = (near & (rank <= k)).nonzero(as_tuple=True)
-        neighbors[b, part[i], rank[b, i, j].long() - 1] = j
-    return neighbors
+    own = torch.arange(n, device=points.device).unsqueeze(1)
+    wanted = torch.arange(1, k + 1, dtype=torch.int32, device=points.device)
+    parts = []
+    for part in own.split(max(1, _CHUNK // max(1, batch * n))):
+        near = torch.cdist(points[:, part[:, 0]], points, compute_mode=_EXACT) <= radius
+        near &= part != own.mT
+        rank = near.cumsum(-1, dtype=torch.int32)  # how many neighbours have this index or less
+        index = torch.searchsorted(rank, wanted.expand(batch, len(part), -1).contiguous())
+        parts.append(torch.where(index < n, index, part))
+    return torch.cat(parts, 1)
 
 
 @torch.no_grad()

@@ -11,6 +11,7 @@ from torch import Tensor
 
 _DENSE = 2**23  # entries up to which the whole matrix is computed at once
 _SLICE = 2**21  # entries of one slice of a larger matrix
+MIN_EXPONENT = -80.0  # below it exp adds nothing to a sum of at least one, and is ten times slower
 
 
 def fits_in_memory(f_x: Tensor, f_y: Tensor) -> bool:
@@ -49,19 +50,25 @@ def softmax_rows(
 @torch.no_grad()
 def argmax_rows(f_x: Tensor, f_y: Tensor, last: Tensor | None = None) -> Tensor:
     """Find the column (B, N) of the largest entry of each row of F_X F_Y^T; M if `last` is."""
-    columns = []
-    for rows in _slices(f_x, f_y):
-        row_max, index = (f_x[:, rows] @ f_y.mT).max(2)
+    column = f_x.new_empty(f_x.shape[:2], dtype=torch.int64)
+    for part in _slices(f_x, f_y):
+        row_max, index = (f_x[part] @ f_y[part[0]].mT).max(2)
         if last is not None:
-            index = torch.where(last[:, rows] > row_max, f_y.shape[1], index)
-        columns.append(index)
-    return torch.cat(columns, 1)
+            index = torch.where(last[part] > row_max, f_y.shape[1], index)
+        column[part] = index
+    return column
 
 
-def _slices(f_x: Tensor, f_y: Tensor) -> list[slice]:
-    """Split the N rows so that a slice of the matrix has at most `_SLICE` entries."""
-    size = max(1, _SLICE // max(1, f_x.shape[0] * f_y.shape[1]))
-    return [slice(start, start + size) for start in range(0, f_x.shape[1], size)]
+def _slices(f_x: Tensor, f_y: Tensor) -> list[tuple[slice, slice]]:
+    """Split the matrices into parts of at most `_SLICE` entries: whole ones, or rows of one."""
+    (batch, n, _), m = f_x.shape, f_y.shape[1]
+    rows = max(1, _SLICE // max(1, m))
+    samples = max(1, rows // max(1, n))
+    return [
+        (slice(b, b + samples), slice(i, i + rows))
+        for b in range(0, batch, samples)
+        for i in range(0, n, rows)
+    ]
 
 
 class _SoftmaxRows(torch.autograd.Function):
@@ -74,17 +81,17 @@ class _SoftmaxRows(torch.autograd.Function):
             f_x.new_empty(f_x.shape[:2]),
             values.new_empty(*f_x.shape[:2], values.shape[2]),
         )
-        for rows in _slices(f_x, f_y):
-            scores = f_x[:, rows] @ f_y.mT
+        for part in _slices(f_x, f_y):
+            scores = f_x[part] @ f_y[part[0]].mT
             row_max = scores.amax(2)
             if last is not None:
-                row_max = torch.maximum(row_max, last[:, rows])
-            prob = scores.sub_(row_max.unsqueeze(2)).exp_()
+                row_max = torch.maximum(row_max, last[part])
+            prob = scores.sub_(row_max.unsqueeze(2)).clamp_min_(MIN_EXPONENT).exp_()
             mass = prob.sum(2)
             if last is not None:
-                mass = mass + (last[:, rows] - row_max).exp()
-            total[:, rows] = row_max + mass.log()
-            mean[:, rows] = prob @ values / mass.unsqueeze(2)
+                mass = mass + (last[part] - row_max).exp()
+            total[part] = row_max + mass.log()
+            mean[part] = prob @ values[part[0]] / mass.unsqueeze(2)
         ctx.save_for_backward(f_x, f_y, values, last, total, mean)
         return total, mean
 
@@ -95,11 +102,12 @@ class _SoftmaxRows(torch.autograd.Function):
         # d S_ij = p_ij (g_i + h_i . v_j) with g_i = grad_total_i - h_i . mean_i
         base = grad_total - (grad_mean * mean).sum(2)
         grad_x, grad_y = torch.empty_like(f_x), torch.zeros_like(f_y)
-        for rows in _slices(f_x, f_y):
-            prob = (f_x[:, rows] @ f_y.mT).sub_(total[:, rows].unsqueeze(2)).exp_()
-            weighted = torch.baddbmm(base[:, rows].unsqueeze(2), grad_mean[:, rows], values.mT)
-            prob.mul_(weighted)
-            grad_x[:, rows] = prob @ f_y
-            grad_y.baddbmm_(prob.mT, f_x[:, rows])
+        for part in _slices(f_x, f_y):
+            samples = part[0]
+            prob = (f_x[part] @ f_y[samples].mT).sub_(total[part].unsqueeze(2))
+            prob.clamp_min_(MIN_EXPONENT).exp_()
+            prob *= torch.baddbmm(base[part].unsqueeze(2), grad_mean[part], values[samples].mT)
+            grad_x[part] = prob @ f_y[samples]
+            grad_y[samples] += prob.mT @ f_x[part]
         grad_last = None if last is None else (last - total).exp() * base
         return grad_x, grad_y, None, grad_last
