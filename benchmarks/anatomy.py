@@ -1,16 +1,17 @@
-"""Where a training step's time goes: operators by kind, as stacked bars.
+"""Where a training step's time goes on one thread: operators by kind, as stacked bars.
 
-    python benchmarks/anatomy.py now        measures this code
-    python benchmarks/anatomy.py "before"   the same for another checkout, by PYTHONPATH=its/src
+    python benchmarks/anatomy.py now      measures this code
+    python benchmarks/anatomy.py before   the same for another checkout, by PYTHONPATH=its/src
 
 Each run replaces its own label in results/bench/anatomy.json and draws results/bench/anatomy.png.
-Every operator is timed by the host as PyTorch dispatches it, so this is for CPUs. What is left of
-an untimed step is the time between operators: Python, autograd, allocation.
+The shares are torch.profiler's, of the operators' own time on a CPU; they are scaled to a step
+without the profiler. What is no operator is the time between them: Python, autograd, views.
+One thread is how two trainings side by side use two cores. It also keeps the comparison free of
+where a virtual machine's cores lie: two threads that share no cache exchange every slab.
 """
 
 import argparse
 import json
-import time
 from collections import Counter
 from typing import Any
 
@@ -18,72 +19,59 @@ import bench
 import matplotlib as mpl
 import torch
 from matplotlib import pyplot as plt
-from torch.utils._python_dispatch import TorchDispatchMode
 
 PLACE = bench.ROOT / "results" / "bench"
-# The first kind whose word occurs in the operator's name.
+# The first kind one of whose words is in the operator's name.
 KINDS = {
     "attention": ("scaled_dot_product",),
     "matrix products": ("mm", "convolution"),
     "norms": ("_norm",),
-    "exponentials": ("exp", "softmax"),
+    "exponentials": ("exp_", "exp2", "logsumexp", "softmax"),
     "maxima, neighbours, rows": (
-        "amax", "max", "topk", "sort", "eq", "nonzero", "scatter", "embedding", "gather", "index",
+        "max", "topk", "sort", "::eq", "nonzero", "scatter", "embedding", "gather", "index_",
         "cdist", "cumsum", "euclidean",
     ),
+}  # fmt: skip
+VIEWS = {
+    "view", "as_strided", "slice", "select", "transpose", "t", "expand", "reshape", "flatten",
+    "unflatten", "unsqueeze", "squeeze", "alias", "detach", "empty", "empty_strided", "empty_like",
+    "unbind", "split", "narrow", "chunk", "movedim", "permute", "to", "resolve_conj",
+    "_unsafe_view",
 }  # fmt: skip
 ELEMENTWISE, BETWEEN = "other, element by element", "between operators"
 # Okabe and Ito's colours, which colour-blind readers can tell apart.
 COLOURS = ("#E69F00", "#0072B2", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#999999")
-REPEATS = 5
+REPEATS = 3
+MOST_POINTS = 1024  # larger clouds take minutes, and spend them on products and attention
 
 
-def kind_of(operator: str) -> str:
-    """Return the kind of an operator by its name."""
+def kind_of(event: str) -> str:
+    """Return the kind of an operator by its name, as torch.profiler writes it."""
+    if not event.startswith("aten::"):
+        return BETWEEN
     for kind, words in KINDS.items():
-        if any(word in operator for word in words):
+        if any(word in event for word in words):
             return kind
-    return ELEMENTWISE
-
-
-class OperatorTimes(TorchDispatchMode):
-    """Sums the seconds of every kind of operator."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.seconds: Counter[str] = Counter()
-
-    def __torch_dispatch__(
-        self,
-        func: Any,  # noqa: ANN401
-        types: Any,  # noqa: ANN401
-        args: tuple[Any, ...] = (),
-        kwargs: dict[str, Any] | None = None,
-    ) -> Any:  # noqa: ANN401
-        """Run an operator and take its time."""
-        start = time.perf_counter()
-        result = func(*args, **(kwargs or {}))
-        self.seconds[kind_of(func.overloadpacket.__name__)] += time.perf_counter() - start
-        return result
+    return BETWEEN if event.removeprefix("aten::") in VIEWS else ELEMENTWISE
 
 
 def dissect(method: str, hparams: dict[str, Any], n: int, batch: int) -> dict[str, float]:
     """Measure the milliseconds a pair of each kind of operator in a training step."""
+    torch.set_num_threads(1)
     pairs, module, step = bench.build(method, hparams, n, batch)
 
     def run() -> None:
         step(bench.loss_of(module, pairs))
 
-    best: Counter[str] | None = None
-    for _ in range(REPEATS):
-        with OperatorTimes() as times:
+    seconds = min(bench.median([run], 1)[0] for _ in range(REPEATS))
+    for _ in range(2):  # the first profile allocates
+        with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
             run()
-        if best is None or times.seconds.total() < best.total():
-            best = times.seconds
-    assert best is not None
-    whole = min(bench.median([run], 1)[0] for _ in range(REPEATS))
-    best[BETWEEN] = max(0.0, whole - best.total())
-    return {kind: round(1e3 * seconds / batch, 3) for kind, seconds in best.items()}
+    own: Counter[str] = Counter()
+    for event in profile.key_averages():
+        own[kind_of(event.key)] += event.self_cpu_time_total
+    scale = 1e3 * seconds / batch / own.total()
+    return {kind: round(scale * time, 3) for kind, time in own.items()}
 
 
 def draw(measured: dict[str, dict[str, dict[str, float]]]) -> None:
@@ -102,7 +90,13 @@ def draw(measured: dict[str, dict[str, dict[str, float]]]) -> None:
             axes.barh(labels, width, left=left, color=colour, label=kind)
             left = [a + b for a, b in zip(left, width, strict=True)]
         for row, total in enumerate(left):
-            axes.text(total, row, f" {total:.3g}", va="center", fontsize=9)
+            axes.text(
+                total,
+                row,
+                f" {total:.3g}" if total < 100 else f" {total:,.0f}",
+                va="center",
+                fontsize=9,
+            )
         axes.set_title(step, fontsize=9, loc="left")
         axes.set_xlim(0, 1.12 * max(left))
         axes.invert_yaxis()
@@ -124,15 +118,15 @@ def main() -> None:
     measured = json.loads(path.read_text()) if path.is_file() else {}
     measured[label] = {}
     for method, hparams, n, batch in bench.STEPS:
+        if n > MOST_POINTS:
+            continue
         size = "laptop network" if hparams else "paper's network"
         name = f"{method}, {size}, N={n}, batch {batch}"
         measured[label][name] = bench.in_a_process(dissect, method, hparams, n, batch)
         print(name, measured[label][name], flush=True)
     path.write_text(json.dumps(measured, indent=1) + "\n")
     draw(measured)
-    print(
-        f"written: {path.relative_to(bench.ROOT)}, anatomy.png; threads: {torch.get_num_threads()}"
-    )
+    print(f"written: {path.relative_to(bench.ROOT)}, anatomy.png")
 
 
 if __name__ == "__main__":

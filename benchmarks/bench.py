@@ -78,7 +78,7 @@ STEPS: tuple[tuple[str, dict[str, Any], int, int], ...] = (
     ("Invariant_corr", {}, 358, 8),
 )
 COMPILED = (STEPS[0], STEPS[6])
-POINTS = (256, 512, 1024, 2048, 4096, 8192, 12288, 16384)
+POINTS = (256, 512, 1024, 2048, 4096, 8192, 16384)
 GROWTH = {"DCP_corr, a step": POINTS, "RPMNet_corr, a step": POINTS, "loss and pose": POINTS}
 
 

@@ -9,10 +9,11 @@ Norm and ReLU keep the order of a channel's values (or reverse it), so the maxim
 them, and the last layer's edges are never stored. Their gradient has two parts, both cheap: few
 edges win a maximum, and the statistics' gradient is an affine function of the layer's input.
 
-`batch_norm_edge_mlp` and `group_norm_edge_mlp` are drop-ins for the plain layers; their twins are
-in tests/twins.py, and `make bench` shows where they pay.
+`batch_norm_edge_mlp`, `group_norm_edge_mlp` and `linear_max` are drop-ins for the plain layers.
+Their twins are in tests/twins.py, and `make bench` shows where they pay.
 """
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -303,12 +304,17 @@ class _LinearGradient:
         if grad_total is not None and grad_square is not None:
             self.slope, self.offset = 2 * grad_square, grad_total
             self.broadcast = _as_slabs(weight, self.slope, self.offset)
-            w = weight.double()
-            self.matrix = ((w.mT * self.slope.unsqueeze(1)) @ w).to(weight.dtype)  # (B, I, I)
             self.constant = self.slope * bias.double() + self.offset  # (B, O)
-            self.vector = (self.constant @ w).to(weight.dtype)  # (B, I)
             self.sum_x = weight.new_zeros(samples, inputs, dtype=wide)
             self.sum_xx = weight.new_zeros(samples, inputs, inputs, dtype=wide)
+
+    @functools.cached_property
+    def _by_x(self) -> tuple[Tensor, Tensor]:
+        """Matrix (B, I, I) and vector (B, I): the sums' gradient by x is x @ matrix + vector."""
+        assert self.slope is not None
+        w = self.weight.double()
+        matrix, vector = (w.mT * self.slope.unsqueeze(1)) @ w, self.constant @ w
+        return matrix.to(self.weight.dtype), vector.to(self.weight.dtype)
 
     def from_output(
         self,
@@ -350,7 +356,8 @@ class _LinearGradient:
             self.sum_x[b] += rows.sum(1)
             self.sum_xx[b] += rows.mT @ rows
             if grad is not None:
-                torch.baddbmm(self.vector[b].unsqueeze(1), rows, self.matrix[b], out=grad)
+                matrix, vector = (t[b] for t in self._by_x)
+                torch.baddbmm(vector.unsqueeze(1), rows, matrix, out=grad)
         elif grad is not None:
             grad.zero_()
         if pooled is not None:

@@ -8,10 +8,17 @@ from pathlib import Path
 from corrmat.errors import CorrmatError
 from corrmat.files import replace_text
 from corrmat.metrics import ADDS_THRESHOLD
+from corrmat.reporting.claims import markdown_claims
 from corrmat.reporting.record import Record, read_records
 from corrmat.reporting.tables import markdown_row, markdown_summary, markdown_tables
 from corrmat.reporting.writer import draw_record
 from corrmat.weights import shipped_calibration
+
+
+def claims_table(results: Path) -> str:
+    """Build the ledger of claims from the records of every scale but smoke."""
+    records = [record for record in read_records(results) if record.scale != "smoke"]
+    return markdown_claims(records, results)
 
 
 def register_table(results: Path) -> str:
@@ -117,6 +124,7 @@ TABLES: tuple[tuple[str, str, Callable[[list[Record], Path], str]], ...] = (
     ("README.md", "results", lambda records, _: markdown_summary(records)),
     ("README.md", "register", lambda _, results: register_table(results)),
     ("docs/reproduction.md", "tables", lambda records, _: markdown_tables(records)),
+    ("docs/claims.md", "claims", lambda _, results: claims_table(results)),
     ("docs/register.md", "networks", lambda _, results: networks_table(results)),
     ("docs/register.md", "confidence", lambda _, results: confidence_table(results)),
     ("docs/speed.md", "bench", lambda _, results: bench_table(results)),

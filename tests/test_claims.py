@@ -1,0 +1,120 @@
+"""The ledger of claims: intervals from pairs, and verdicts by the rule."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from corrmat.reporting import claims, intervals
+from corrmat.reporting.claims import Evidence, verdict_of_ratio
+from corrmat.reporting.intervals import Estimate, PairErrors
+from corrmat.reporting.record import ArmResult, Record
+
+
+def errors(values, correct=None, band=None):
+    values = np.asarray(values, float)
+    correct = np.full(len(values), np.nan) if correct is None else np.asarray(correct, float)
+    band = np.zeros(len(values), int) if band is None else np.asarray(band)
+    return PairErrors(values, correct, np.full(len(values), 10.0), band)
+
+
+def drawn(scale, size=300, seed=0):
+    return errors(scale * np.random.default_rng(seed).rayleigh(size=size))
+
+
+def evidence(method, method_corr, identity=90.0, bands_deg=(), curves=((), ())):
+    arms = {
+        name: ArmResult({}, pairs_seen=1000, curve=list(curve))
+        for name, curve in zip(("DCP", "DCP_corr"), curves, strict=True)
+    }
+    paper = {
+        "DCP": ArmResult({"relative_euler_rmse_deg": 8.0}),
+        "DCP_corr": ArmResult({"relative_euler_rmse_deg": 2.0}),
+    }
+    record = Record(
+        "1.1", "full clouds", "laptop", "shapes", "DCP", "DCP", "DCP_corr", [], 0, None, {}, {}, "",
+        list(bands_deg), arms, {}, paper,
+    )  # fmt: skip
+    return Evidence(record, {"DCP": method, "DCP_corr": method_corr}, identity)
+
+
+def test_the_interval_covers_the_truth_as_often_as_it_says():
+    """Of 200 samples, about 95 % have the true median within their interval."""
+    truth = np.sqrt(2 * np.log(2))
+    found = [intervals.median_rotation(drawn(1.0, 80, seed)) for seed in range(200)]
+    covered = np.mean([e.low <= truth <= e.high for e in found])
+    assert 0.89 < covered <= 1
+    assert all(e.low <= e.value <= e.high for e in found)
+
+
+def test_pairs_are_resampled_together():
+    """The ratio of two arms that fail on the same pairs is known better than either median."""
+    one = drawn(1.0)
+    other = errors(one.rotation_deg / 2)
+    ratio = intervals.ratio_of_medians(one, other)
+    assert (ratio.low, ratio.value, ratio.high) == pytest.approx((2, 2, 2))
+
+
+def test_matches_are_shares_of_points_not_of_pairs():
+    share = intervals.match_accuracy(errors([1, 1], correct=[10, 5]))
+    assert share.value == 0.75
+
+
+def test_equal_arms_have_a_large_p_and_others_a_small_one():
+    assert intervals.p_of_equal_errors(drawn(1.0), drawn(1.0)) == 1
+    assert intervals.p_of_equal_errors(drawn(1.0, seed=1), drawn(1.0, seed=2)) > 0.01
+    assert intervals.p_of_equal_errors(drawn(1.0, seed=1), drawn(0.5, seed=2)) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("ratio", "paper", "learnt", "verdict"),
+    [
+        ((9, 8, 10), 10, True, "confirmed"),
+        ((5, 4, 6), 10, True, "confirmed"),  # half of the paper's ratio
+        ((4.9, 4, 6), 10, True, "confirmed in direction"),
+        ((9, 8, 10), None, True, "confirmed in direction"),
+        ((1.1, 0.9, 1.3), 1, True, "not shown"),
+        ((0.8, 0.7, 0.9), 1, True, "contradicted"),
+        ((300, 200, 400), 10, False, "not shown"),  # an opponent that learnt nothing
+    ],
+)
+def test_verdicts(ratio, paper, learnt, verdict):
+    assert verdict_of_ratio(Estimate(*ratio), paper, learnt) == verdict
+
+
+def test_an_arm_at_the_identity_guess_shows_nothing():
+    claim = claims.less_error(evidence(drawn(60.0), drawn(0.3)))
+    assert claim.verdict == "not shown"
+    assert "identity" in claim.ours
+    claim = claims.less_error(evidence(drawn(6.0), drawn(0.3)))
+    assert claim.verdict == "confirmed"
+    assert claim.paper == "8 → 2 deg: 4 times"
+
+
+def test_sooner_counts_the_pairs_to_the_others_best_error():
+    def curve(*values):
+        return [
+            {"pairs_seen": 250.0 * (i + 1), "rotation_error_deg_mean": v}
+            for i, v in enumerate(values)
+        ]
+
+    for treatment, verdict in (
+        (curve(9, 3, 2, 1), "confirmed"),
+        (curve(9, 8, 3, 1), "confirmed in direction"),
+        (curve(9, 8, 7, 6), "contradicted"),
+    ):
+        judged = claims.sooner(
+            evidence(drawn(6.0), drawn(0.3), curves=(curve(9, 8, 7, 4), treatment))
+        )
+        assert judged.verdict == verdict
+
+
+def test_growth_over_bands():
+    edges = (0, 30, 60)
+    flat = errors(
+        [*drawn(1.0).rotation_deg, *drawn(1.2, seed=1).rotation_deg], band=[0] * 300 + [1] * 300
+    )
+    steep = dataclasses.replace(flat, rotation_deg=flat.rotation_deg * (1 + 4 * flat.band))
+    for treatment, verdict in ((flat, "confirmed"), (steep, "contradicted")):
+        judged = claims.flat_over_misalignment(evidence(flat, treatment, bands_deg=edges))
+        assert judged.verdict == verdict
