@@ -69,7 +69,6 @@ STEPS: tuple[tuple[str, dict[str, Any], int, int], ...] = (
     ("DCP_corr", DCP_LAPTOP, 128, 4),
     ("DCP_corr", {}, 512, 16),
     ("DCP_corr", {}, 2048, 1),
-    ("DCP_corr", {}, 4096, 1),
     ("RPMNet_corr", RPMNET_LAPTOP, 256, 2),
     ("RPMNet_corr", {}, 1024, 4),
     ("PCRNet_corr", {}, 100, 32),
@@ -77,7 +76,7 @@ STEPS: tuple[tuple[str, dict[str, Any], int, int], ...] = (
     ("PCRNet", {}, 100, 8),
     ("Invariant_corr", {}, 358, 8),
 )
-COMPILED = (STEPS[0], STEPS[6])
+COMPILED = (STEPS[0],)
 POINTS = (256, 512, 1024, 2048, 4096, 8192)
 GROWTH = {"DCP_corr, a step": POINTS, "RPMNet_corr, a step": POINTS, "loss and pose": POINTS}
 

@@ -30,7 +30,7 @@ def test_every_recipe_builds_at_every_scale(path, scale):
     assert experiment.id == path.stem
     baseline = experiment.arms[experiment.baseline]
     assert list(experiment.paper) == [experiment.baseline, experiment.treatment]
-    assert bool(experiment.controls) == (path.stem in ("2.1", "2.4", "outliers"))
+    assert bool(experiment.controls) == (path.stem in ("2.1", "2.2", "2.3", "2.4", "outliers"))
     for settings in experiment.arms.values():
         assert isinstance(build_method(settings), METHODS[settings.method])
         pairs = settings.data.as_dict() | {"batch_size": None}

@@ -25,6 +25,7 @@ from torch import Tensor, nn
 _SLAB_VALUES = 2**20  # values of the edges that are processed together, on a CPU
 _GPU_SLAB_VALUES = 2**27
 _MIN_EDGES = 2**15  # below, the plain layers of DGCNN are as fast
+_MIN_ROWS = 2**12  # below, plain layers with group norms are faster
 
 Linear = nn.Linear | nn.Conv1d
 Norm = nn.BatchNorm1d | nn.GroupNorm
@@ -91,6 +92,8 @@ def group_norm_edge_mlp(edges: Tensor, mlp: nn.Sequential) -> Tensor:
         assert channels is not None
         return _group_statistics(channels, norm.num_groups)
 
+    if edges[..., 0].numel() < _MIN_ROWS:
+        return mlp(edges.flatten(1, 2).mT).unflatten(-1, edges.shape[1:3]).amax(-1).mT
     layers = list(zip(mlp[::3], mlp[1::3], strict=True))
     return _edge_mlp(edges, layers, statistics_of, gather=True, pool_all=False)[0]
 

@@ -91,8 +91,7 @@ def p_of_equal_errors(one: PairErrors, other: PairErrors) -> float:
     difference = one.rotation_deg - other.rotation_deg
     if not difference.any():
         return 1.0
-    _, p = stats.wilcoxon(difference)
-    return float(p)
+    return float(np.asarray(stats.wilcoxon(difference))[1])
 
 
 def _median(values: np.ndarray) -> np.ndarray:
