@@ -307,7 +307,7 @@ def classical(name: str) -> Row:
 
 def registered_pair() -> Row:
     """Milliseconds of `corrmat.register` on `real` pairs: overlap, noise, outliers."""
-    pairs = frozen_pairs("real", "shapes", 1024, None, 12)
+    pairs = frozen_pairs(protocol="real", data="shapes", points=1024, root=None, count=12)
     clouds = zip(pairs.source.double().numpy(), pairs.target.double().numpy(), strict=True)
     works = [lambda x=x[:, :3], y=y[:, :3]: register(x, y) for x, y in clouds]
     return {"ms": round(1e3 * statistics.median(median(works, 3)), 1)}
