@@ -103,9 +103,7 @@ def linear_max(rows: Tensor, linear: nn.Linear) -> Tensor:
 
     Equal to `linear(rows).amax(1)`, but of equal maxima one gets the gradient. N is at most 32,767.
     """
-    device = rows.device.type
-    if torch.is_autocast_enabled(device):
-        rows = rows.to(torch.get_autocast_dtype(device))
+    rows = _autocast(rows)
     weight, bias = (t.to(rows.dtype) for t in (linear.weight, linear.bias))
     _, pooled, _, _ = _Layer.apply(
         rows.unsqueeze(1), None, None, weight, bias, False, True, False
@@ -130,9 +128,7 @@ def _edge_mlp(
         gather: whether to gather the statistics of the channels.
         pool_all: whether to pool after every layer.
     """
-    device = edges.device.type
-    if torch.is_autocast_enabled(device):
-        edges = edges.to(torch.get_autocast_dtype(device))
+    edges = _autocast(edges)
     count = edges.shape[1] * edges.shape[2]
     scale, shift, maxima = None, None, []
     for index, (linear, norm) in enumerate(layers, 1):
@@ -457,6 +453,14 @@ def _active(
         return values
     scale, shift = (value[slab[0]] for value in norm)
     return torch.addcmul(shift, values, scale, out=scratch("x", values.shape)).relu_()
+
+
+def _autocast(values: Tensor) -> Tensor:
+    """Convert values to the format of autocast, if it is on."""
+    device = values.device.type
+    if torch.is_autocast_enabled(device):
+        return values.to(torch.get_autocast_dtype(device))
+    return values
 
 
 def _wide(values: Tensor) -> torch.dtype:

@@ -69,7 +69,7 @@ class Evidence:
 
     def left_identity(self, errors: PairErrors) -> bool:
         """Tell whether an arm is clearly better than guessing the identity."""
-        return median_rotation(errors).value < LEFT_BASELINE * self.identity_median_deg
+        return errors.median_deg < LEFT_BASELINE * self.identity_median_deg
 
 
 def read_evidence(record: Record, results: Path) -> Evidence:

@@ -30,6 +30,11 @@ class PairErrors:
         """How many pairs are off by more than `FLIPPED_DEG`."""
         return int((self.rotation_deg > FLIPPED_DEG).sum())
 
+    @property
+    def median_deg(self) -> float:
+        """The median rotation error, without its interval."""
+        return float(np.median(self.rotation_deg))
+
     def of_band(self, band: int) -> "PairErrors":
         """Return the pairs of one rotation band."""
         inside = self.band == band
