@@ -383,8 +383,11 @@ def no_network(monkeypatch):
 
 
 def test_wandb_holds_config_curves_table_pictures_and_clouds_offline(tmp_path, no_network):
+    import wandb
+
     loaded = load("1.2")
     experiment.run(loaded, tmp_path / "results", tmp_path / "runs", logger="wandb")
+    wandb.teardown()  # a finished run's file is complete when wandb's service has ended
     runs = tmp_path / "runs" / "smoke" / "shapes" / "1.2"
     read = {}
     for path in runs.glob("**/offline-run-*/*.wandb"):
