@@ -16,10 +16,10 @@ OPTIONS = --scale $(SCALE) --data.data $(DATA) $(if $(ROOT),--data.root "$(ROOT)
 # What a cluster has trained anew is not trained a second time to be tested.
 RUN_OPTIONS = $(OPTIONS) $(if $(filter ray,$(LAUNCHER)),$(filter-out --fresh,$(ARGS)),$(ARGS))
 
-.PHONY: help $(EXPERIMENTS) outliers robustness all on-ray weights protocols docs report bench lint format test test-slow test-oldest lock clean
+.PHONY: help $(EXPERIMENTS) outliers robustness all on-ray rates weights protocols docs report bench lint format test test-slow test-oldest lock clean
 
 help:  ## list the targets
-	@echo "make TARGET [SCALE=smoke|laptop|paper] [DATA=shapes|modelnet40|folder] [ROOT=folder] [NAME=chairs] [ARGS='--key value']"
+	@echo "make TARGET [SCALE=smoke|laptop|overnight|paper] [DATA=shapes|modelnet40|folder] [ROOT=folder] [NAME=chairs] [ARGS='--key value']"
 	@grep -hE '^[a-z$$()_A-Z0-9.-]+:.*##' $(MAKEFILE_LIST) | sed 's/\$$(EXPERIMENTS)/exp1.1 ... exp3.3/; s/:.*##/\t/' | expand -t 22
 
 $(EXPERIMENTS): exp%: .venv/ready  ## train both arms of an experiment, print ours beside the paper's
@@ -35,6 +35,9 @@ all: $(if $(filter ray,$(LAUNCHER)),on-ray) robustness $(EXPERIMENTS) outliers  
 
 on-ray: .venv/ready
 	$(BIN)/python reproduce/on_ray.py $(OPTIONS) $(ARGS)
+
+rates: .venv/ready  ## three learning rates for every arm, a twentieth of SCALE's training each
+	$(BIN)/python reproduce/rates.py $(OPTIONS) $(ARGS)
 
 weights: .venv/ready  ## train what `corrmat register` ships on the embedded shapes, put it into the package
 	$(BIN)/python reproduce/weights.py --scale $(SCALE) $(ARGS)

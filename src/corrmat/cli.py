@@ -50,6 +50,21 @@ def train_on_ray() -> None:
         sys.exit(f"corrmat: error: {error}")
 
 
+def sweep_rates(experiments: Sequence[str]) -> None:
+    """Choose the rates of these experiments' arms, or of --config's: reproduce/rates.py."""
+    try:
+        options = parse(["run", *sys.argv[1:]])
+        from corrmat.training import rates, recipe
+
+        _prepare_output(options)
+        paths = [_config_folder() / f"{name}.yaml" for name in experiments]
+        for path in [options.config] if options.config else paths:
+            loaded = recipe.load(path, options.scale, options.overrides)
+            rates.sweep(loaded, options.results, options.runs, options.logger)
+    except CorrmatError as error:
+        sys.exit(f"corrmat: error: {error}")
+
+
 def train_weights(recipe: Path) -> None:
     """Train the weights that `corrmat register` ships: reproduce/weights.py.
 

@@ -72,7 +72,7 @@ NPY, NPZ. Both files must have the same unit, whichever it is. Parts may be miss
 
 exit codes: 0 done, whatever the verdict; 2 a file cannot be used, and one line says why."""
 
-Scale = Literal["smoke", "laptop", "paper"]
+Scale = Literal["smoke", "laptop", "overnight", "paper"]
 EXPERIMENT_COMMANDS = ("run", "fit", "evaluate")
 
 

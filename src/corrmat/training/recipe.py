@@ -23,7 +23,7 @@ from corrmat.methods import METHODS
 from corrmat.module import OptimizerSettings
 from corrmat.reporting.record import ArmResult
 
-SCALES = ("smoke", "laptop", "paper")
+SCALES = ("smoke", "laptop", "overnight", "paper")
 GROUPS = ("data", "network", "loss", "optimizer", "trainer")
 Precision = Literal["auto", "32-true", "64-true", "bf16-mixed", "bf16-true", "16-mixed"]
 Settings = dict[str, object]

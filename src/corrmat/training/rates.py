@@ -1,0 +1,102 @@
+"""A learning-rate sweep: every arm's rate is chosen by the same short trainings on validation."""
+
+import json
+import logging
+from copy import deepcopy
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from corrmat.errors import CorrmatError
+from corrmat.files import ensure_writable, replace_text
+from corrmat.reporting.provenance import commit
+from corrmat.training import loggers
+from corrmat.training.console import Board
+from corrmat.training.experiment import train_or_reuse
+from corrmat.training.fit import MONITOR
+from corrmat.training.preflight import prepare
+from corrmat.training.recipe import ArmSettings, Recipe
+
+log = logging.getLogger("corrmat")
+FACTORS = (1 / 3, 1.0, 3.0)  # of the recipe's rate
+BUDGET = 1 / 20  # of an arm's training
+FOLDER = "rates"  # below results/
+_METRIC = MONITOR.removeprefix("val/")
+
+
+@dataclass(frozen=True)
+class RateResult:
+    """How one learning rate did; keys of the record's JSON."""
+
+    lr: float
+    rotation_error_deg_mean: float  # on validation, when the short training ends
+    loss: float
+    pairs_seen: int
+
+
+def sweep(
+    recipe: Recipe, results: Path, runs_folder: Path, logger: loggers.Choice = "csv"
+) -> dict[str, list[RateResult]]:
+    """Train every arm for a twentieth of its budget at three rates, and write what came out.
+
+    Arms with a steady rate are left out: theirs is the paper's own.
+
+    Args:
+        recipe: the experiment at the scale whose budget counts.
+        results: folder of records; this one goes to rates/<id>.json.
+        runs_folder: folder of checkpoints and logs, resumed where one was interrupted.
+        logger: see `loggers.make_loggers`.
+
+    Returns:
+        By arm, the results in the order of the rates.
+    """
+    ensure_writable(results / FOLDER)
+    arms = {n: s for n, s in recipe.arms.items() if s.optimizer.schedule == "onecycle"}
+    if not arms:
+        raise CorrmatError(f"{recipe.id} at {recipe.scale} scale has no arm with a rate to choose")
+    place = replace(recipe, id=f"{recipe.id}-rates", networks_of=None)
+    swept: dict[str, list[RateResult]] = {}
+    with Board() as board:
+        for name, settings in arms.items():
+            swept[name] = []
+            for factor in FACTORS:
+                arm = prepare(_short(settings, factor))
+                log.info(f"\n{recipe.id} {arm.name}")
+                trained = train_or_reuse(place, arm, runs_folder, logger, board)
+                last = trained.curve[-1]
+                swept[name].append(
+                    RateResult(
+                        arm.settings.optimizer.lr, last[_METRIC], last["loss"], trained.pairs_seen
+                    )
+                )
+    content = {
+        "id": recipe.id,
+        "scale": recipe.scale,
+        "data": recipe.data,
+        "commit": commit(),
+        "arms": {
+            name: {"chosen": chosen(rates), "rates": [vars(rate) for rate in rates]}
+            for name, rates in swept.items()
+        },
+    }
+    (results / FOLDER).mkdir(parents=True, exist_ok=True)
+    replace_text(results / FOLDER / f"{recipe.id}.json", json.dumps(content, indent=1) + "\n")
+    return swept
+
+
+def chosen(rates: list[RateResult]) -> float:
+    """Return the rate with the lowest rotation error on validation."""
+    return min(rates, key=lambda rate: rate.rotation_error_deg_mean).lr
+
+
+def _short(settings: ArmSettings, factor: float) -> ArmSettings:
+    """Return an arm's settings with another rate and a twentieth of the steps."""
+    lr = float(f"{settings.optimizer.lr * factor:.2g}")
+    trainer = deepcopy(settings.trainer)
+    trainer.max_steps = max(2, round(trainer.max_steps * BUDGET))
+    trainer.val_check_interval = trainer.max_steps
+    return replace(
+        settings,
+        name=f"{settings.name}-{lr:g}",
+        optimizer=replace(settings.optimizer, lr=lr),
+        trainer=trainer,
+    )
