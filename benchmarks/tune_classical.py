@@ -2,7 +2,7 @@
 
     python benchmarks/tune_classical.py        minutes; needs pip install open3d
 
-The best settings are `RANSAC` and `FGR` in corrmat.registration.hypotheses; all that were tried,
+The best settings are `FPFH_RANSAC` and `FPFH_FGR` in corrmat.baselines; all that were tried,
 with their recalls, are in results/register/tuning.json.
 """
 
@@ -11,8 +11,8 @@ import itertools
 import json
 from pathlib import Path
 
+from corrmat.baselines import FpfhSettings
 from corrmat.registration import benchmark, hypotheses
-from corrmat.registration.hypotheses import ClassicalSettings
 
 RESULTS = Path(__file__).resolve().parents[1] / "results" / "register" / "tuning.json"
 PAIRS = 60
@@ -31,9 +31,7 @@ def main() -> None:
     ):
         if model == "fgr" and mutual:
             continue  # it filters its matches itself
-        settings = ClassicalSettings(
-            feature_radius=radius, inlier_threshold=threshold, mutual=mutual
-        )
+        settings = FpfhSettings(feature_radius=radius, inlier_threshold=threshold, mutual=mutual)
         tried = functools.partial(getattr(hypotheses, model), settings=settings)
         hypotheses.CLASSICAL["tried"] = tried
         row = {"model": model, **settings._asdict()}

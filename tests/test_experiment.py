@@ -11,6 +11,7 @@ import os
 import re
 import signal
 import socket
+import sys
 
 import pytest
 import torch
@@ -338,6 +339,31 @@ def test_nothing_is_deleted_or_trained_when_the_test_split_cannot_be_read(tmp_pa
         with pytest.raises(CorrmatError):
             experiment.run(load("1.1", *bad, arms=["DCP"]), tmp_path / "results", tmp_path / "runs")
         assert best.stat().st_mtime_ns == before
+
+
+def test_another_seed_has_a_record_of_its_own(tmp_path):
+    loaded = load("2.4", "--seed", "3")
+    assert loaded.place.as_posix() == "smoke/shapes/2.4-seed3"
+    assert loaded.place_of("2.1").as_posix() == "smoke/shapes/2.1-seed3"
+    assert load("2.4").place.as_posix() == "smoke/shapes/2.4"
+    record = Record.from_json(
+        {"id": "2.4", "scale": "smoke", "data": "shapes", "seed": 3, "arms": {}}
+    )
+    assert record.place == loaded.place
+
+
+def test_a_baseline_whose_package_is_missing_is_left_out(tmp_path, monkeypatch, caplog):
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    record = experiment.run(load("1.1"), tmp_path / "results", tmp_path / "runs")
+    assert list(record.baselines) == ["identity", "untrained"]
+    assert "ransac is left out: pip install open3d" in caplog.text
+
+
+def test_ransac_solves_identical_points(tmp_path):
+    """The paper's setting, without training: a learned network competes with this."""
+    pytest.importorskip("open3d")
+    record = experiment.run(load("1.1"), tmp_path / "results", tmp_path / "runs")
+    assert record.baselines["ransac"].get("rotation_error_deg_median") < 1e-4
 
 
 @pytest.mark.parametrize("option", ["iterations", "test_iterations"])

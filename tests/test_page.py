@@ -137,6 +137,8 @@ def test_a_record_whose_code_has_changed_is_marked(tmp_path):
     recipe = tmp_path / "configs" / "exp" / "1.1.yaml"
     recipe.write_text("id: '1.1'  # of the paper\n")
     assert staleness() == ""
+    recipe.write_text("id: '1.1'\nbaselines: [identity]\nscales: {paper: {seed: 1}}\n")
+    assert staleness() == ""  # nor what another scale or a baseline does
     recipe.write_text("id: '1.1'\nseed: 1\n")
     assert staleness() == "changed since: 1.1.yaml"
     git("checkout", "configs")

@@ -1,7 +1,17 @@
-"""Baselines that need no training: a learned network must beat them."""
+"""Baselines that need no training: a learned network must beat them.
 
+The classical pipelines are Open3D's, over FPFH features (Rusu et al., ICRA 2009). Their lengths are
+in units in which a cloud's radius is about one.
+"""
+
+import importlib
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
 from torch import Tensor, nn
 
+from corrmat.errors import CorrmatError
 from corrmat.ops import rigid
 from corrmat.ops.correspondence import SoftCorrespondence
 from corrmat.types import Prediction
@@ -38,5 +48,129 @@ class Radius(nn.Module):
         return Prediction(rotation.to(source.dtype), translation.to(source.dtype), c)
 
 
-BASELINES: dict[str, type[nn.Module]] = {"identity": Identity, "radius": Radius}
+class Ransac(nn.Module):
+    """RANSAC over FPFH features, refined by ICP: what a practitioner would try first.
+
+    It gets the normals of the pairs, which are the mesh's own.
+    """
+
+    SEED = 0
+
+    def forward(self, source: Tensor, target: Tensor) -> Prediction:
+        """Register source (B, N, 6) to target (B, M, 6), xyz and unit normal; no correspondence."""
+        clouds = zip(source.double().cpu().numpy(), target.double().cpu().numpy(), strict=True)
+        found = np.stack([fpfh_ransac(x, y, self.SEED, refine=True) for x, y in clouds])
+        transform = torch.from_numpy(found).to(source)
+        return Prediction(transform[:, :3, :3], transform[:, :3, 3])
+
+
+class FpfhSettings(NamedTuple):
+    """Lengths and counts of the pipelines over FPFH features."""
+
+    feature_radius: float
+    inlier_threshold: float
+    mutual: bool = True  # RANSAC only: keep matches that are each other's best
+    feature_neighbors: int = 100
+    iterations: int = 100_000
+
+
+# The best settings that benchmarks/tune_classical.py tries on validation pairs.
+FPFH_RANSAC = FpfhSettings(feature_radius=0.65, inlier_threshold=0.12)
+FPFH_FGR = FpfhSettings(feature_radius=0.65, inlier_threshold=0.05)
+
+
+def fpfh_ransac(
+    source: np.ndarray,
+    target: np.ndarray,
+    seed: int,
+    settings: FpfhSettings = FPFH_RANSAC,
+    *,
+    refine: bool = False,
+) -> np.ndarray:
+    """Run RANSAC over matches of FPFH features.
+
+    Args:
+        source: (N, 6), xyz and unit normal.
+        target: (M, 6).
+        seed: of the draws.
+        settings: lengths and counts.
+        refine: run point-to-point ICP after it.
+
+    Returns:
+        The transform (4, 4) of source onto target.
+
+    Raises:
+        CorrmatError: Open3D cannot be imported.
+    """
+    o3d, clouds, features = _fpfh(source, target, settings)
+    registration = o3d.pipelines.registration
+    o3d.utility.random.seed(seed)
+    point_to_point = registration.TransformationEstimationPointToPoint(False)
+    result = registration.registration_ransac_based_on_feature_matching(
+        *clouds,
+        *features,
+        settings.mutual,
+        settings.inlier_threshold,
+        point_to_point,
+        3,
+        [
+            registration.CorrespondenceCheckerBasedOnEdgeLength(0.9),
+            registration.CorrespondenceCheckerBasedOnDistance(settings.inlier_threshold),
+        ],
+        registration.RANSACConvergenceCriteria(settings.iterations, 0.999),
+    )
+    if refine:
+        result = registration.registration_icp(
+            *clouds, settings.inlier_threshold, result.transformation, point_to_point
+        )
+    return np.array(result.transformation)
+
+
+def fpfh_fgr(
+    source: np.ndarray, target: np.ndarray, seed: int, settings: FpfhSettings = FPFH_FGR
+) -> np.ndarray:
+    """Run Fast Global Registration (Zhou et al., ECCV 2016); see `fpfh_ransac`."""
+    o3d, clouds, features = _fpfh(source, target, settings)
+    registration = o3d.pipelines.registration
+    o3d.utility.random.seed(seed)
+    option = registration.FastGlobalRegistrationOption(
+        maximum_correspondence_distance=settings.inlier_threshold
+    )
+    result = registration.registration_fgr_based_on_feature_matching(*clouds, *features, option)
+    return np.array(result.transformation)
+
+
+def _fpfh(
+    source: np.ndarray, target: np.ndarray, settings: FpfhSettings
+) -> tuple[Any, list[Any], list[Any]]:
+    """Compute Open3D's clouds and FPFH features; return them behind the open3d module."""
+    try:
+        o3d: Any = importlib.import_module("open3d")
+    except ImportError as error:
+        raise CorrmatError(f"ransac and fgr are Open3D's: pip install open3d ({error})") from error
+    clouds, features = [], []
+    for points in (source, target):
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[:, :3].astype(float)))
+        cloud.normals = o3d.utility.Vector3dVector(points[:, 3:].astype(float))
+        search = o3d.geometry.KDTreeSearchParamHybrid(
+            settings.feature_radius, settings.feature_neighbors
+        )
+        clouds.append(cloud)
+        features.append(o3d.pipelines.registration.compute_fpfh_feature(cloud, search))
+    return o3d, clouds, features
+
+
+BASELINES: dict[str, type[nn.Module]] = {
+    "identity": Identity, "radius": Radius, "ransac": Ransac,
+}  # fmt: skip
 UNTRAINED = "untrained"  # the baseline that is the arms' own network before training
+OPTIONAL = {"ransac": "open3d"}  # baselines that need a package of the extra `baselines`
+
+
+def is_available(name: str) -> bool:
+    """Tell whether the package that a baseline needs can be imported."""
+    try:
+        importlib.import_module(OPTIONAL.get(name, __name__))
+    except ImportError:
+        return False
+    return True

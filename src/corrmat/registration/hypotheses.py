@@ -4,14 +4,14 @@ All generators have one signature, and `register` refines, scores and selects th
 the same way. Lengths are in units in which a cloud's radius is about one.
 """
 
-import importlib
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import nn
 
+from corrmat.baselines import FPFH_FGR, FPFH_RANSAC, FpfhSettings, fpfh_fgr, fpfh_ransac
 from corrmat.errors import CorrmatError
 from corrmat.ops.ransac import ransac as ransac_on_matches
 
@@ -116,76 +116,18 @@ def icp(source: np.ndarray, target: np.ndarray, seed: int) -> Hypotheses:
     return Hypotheses(transform[None], *_NO_MATCHES)
 
 
-class ClassicalSettings(NamedTuple):
-    """Lengths and counts of the classical pipelines."""
-
-    feature_radius: float
-    inlier_threshold: float
-    mutual: bool = True  # RANSAC only: keep matches that are each other's best
-    feature_neighbors: int = 100
-    iterations: int = 100_000
-
-
-# The best settings that benchmarks/tune_classical.py tries on validation pairs.
-RANSAC = ClassicalSettings(feature_radius=0.65, inlier_threshold=0.12)
-FGR = ClassicalSettings(feature_radius=0.65, inlier_threshold=0.05)
-
-
 def ransac(
-    source: np.ndarray, target: np.ndarray, seed: int, settings: ClassicalSettings = RANSAC
+    source: np.ndarray, target: np.ndarray, seed: int, settings: FpfhSettings = FPFH_RANSAC
 ) -> Hypotheses:
-    """Run RANSAC over matches of FPFH features (Rusu et al., ICRA 2009; Open3D)."""
-    o3d, clouds, features = _fpfh(source, target, settings)
-    registration = o3d.pipelines.registration
-    o3d.utility.random.seed(seed)
-    result = registration.registration_ransac_based_on_feature_matching(
-        *clouds,
-        *features,
-        settings.mutual,
-        settings.inlier_threshold,
-        registration.TransformationEstimationPointToPoint(False),
-        3,
-        [
-            registration.CorrespondenceCheckerBasedOnEdgeLength(0.9),
-            registration.CorrespondenceCheckerBasedOnDistance(settings.inlier_threshold),
-        ],
-        registration.RANSACConvergenceCriteria(settings.iterations, 0.999),
-    )
-    return Hypotheses(np.asarray(result.transformation)[None].copy(), *_NO_MATCHES)
+    """Return the one hypothesis of RANSAC over FPFH features."""
+    return Hypotheses(fpfh_ransac(source, target, seed, settings)[None], *_NO_MATCHES)
 
 
 def fgr(
-    source: np.ndarray, target: np.ndarray, seed: int, settings: ClassicalSettings = FGR
+    source: np.ndarray, target: np.ndarray, seed: int, settings: FpfhSettings = FPFH_FGR
 ) -> Hypotheses:
-    """Run Fast Global Registration over FPFH features (Zhou et al., ECCV 2016; Open3D)."""
-    o3d, clouds, features = _fpfh(source, target, settings)
-    registration = o3d.pipelines.registration
-    o3d.utility.random.seed(seed)
-    option = registration.FastGlobalRegistrationOption(
-        maximum_correspondence_distance=settings.inlier_threshold
-    )
-    result = registration.registration_fgr_based_on_feature_matching(*clouds, *features, option)
-    return Hypotheses(np.asarray(result.transformation)[None].copy(), *_NO_MATCHES)
-
-
-def _fpfh(
-    source: np.ndarray, target: np.ndarray, settings: ClassicalSettings
-) -> tuple[Any, list[Any], list[Any]]:
-    """Compute Open3D's clouds and FPFH features; return them behind the open3d module."""
-    try:
-        o3d: Any = importlib.import_module("open3d")
-    except ImportError as error:
-        raise CorrmatError("ransac and fgr are Open3D's: pip install open3d") from error
-    clouds, features = [], []
-    for points in (source, target):
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[:, :3].astype(float)))
-        cloud.normals = o3d.utility.Vector3dVector(points[:, 3:].astype(float))
-        search = o3d.geometry.KDTreeSearchParamHybrid(
-            settings.feature_radius, settings.feature_neighbors
-        )
-        clouds.append(cloud)
-        features.append(o3d.pipelines.registration.compute_fpfh_feature(cloud, search))
-    return o3d, clouds, features
+    """Return the one hypothesis of Fast Global Registration over FPFH features."""
+    return Hypotheses(fpfh_fgr(source, target, seed, settings)[None], *_NO_MATCHES)
 
 
 CLASSICAL: dict[str, HypothesisGenerator] = {"icp": icp, "ransac": ransac, "fgr": fgr}

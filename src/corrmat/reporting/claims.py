@@ -64,8 +64,9 @@ class Evidence:
 
     @property
     def where(self) -> str:
-        """Scale and data set."""
-        return f"{self.record.scale}, {self.record.data}"
+        """Scale, data set, and the seed unless it is 0."""
+        seed = f", seed {self.record.seed}" if self.record.seed else ""
+        return f"{self.record.scale}, {self.record.data}{seed}"
 
     def left_identity(self, errors: PairErrors) -> bool:
         """Tell whether an arm is clearly better than guessing the identity."""
@@ -189,15 +190,15 @@ def lower_in_every_band(evidence: Evidence) -> Claim:
 
 
 def loss_not_rate(evidence: Evidence) -> Claim | None:
-    """RPMNet_corr's gain is the loss's, not the learning rate's: RPMNet at the same rate."""
+    """RPMNet_corr's gain is the loss's, not the learning rate's: RPMNet at a high rate."""
     record = evidence.record
     control = next((c for c in record.controls if c.endswith("high_rate")), None)
     if control is None:
         return None
     ratio = ratio_of_medians(evidence.errors[control], evidence.treatment)
     return Claim(
-        f"{record.id}: RPMNet_corr registers better than RPMNet at the same rate",
-        "(RPMNet was unstable at this rate)",
+        f"{record.id}: RPMNet_corr registers better than RPMNet at its own best high rate",
+        "(RPMNet was unstable at high rates)",
         f"{_text(median_rotation(evidence.errors[control]), 'deg')} → "
         f"{_text(median_rotation(evidence.treatment), 'deg')}: {_text(ratio)} times",
         evidence.where,

@@ -131,6 +131,11 @@ TABLES: tuple[tuple[str, str, Callable[[list[Record], Path], str]], ...] = (
 )
 
 
+def documented_records(results: Path) -> list[Record]:
+    """Read the records of README.md and docs/reproduction.md: every scale but smoke, seed 0."""
+    return [r for r in read_records(results) if r.scale != "smoke" and r.seed == 0]
+
+
 def rewrite_documents(results: Path, root: Path) -> int:
     """Rewrite every table of the documents and redraw the records' pictures.
 
@@ -144,7 +149,7 @@ def rewrite_documents(results: Path, root: Path) -> int:
     Raises:
         CorrmatError: a document, or a mark in it, is missing.
     """
-    records = read_records(results, scale="laptop")
+    records = documented_records(results)
     for record in records:
         draw_record(results / record.place)
     for page, mark, content in TABLES:

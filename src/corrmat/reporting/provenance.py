@@ -13,9 +13,10 @@ from corrmat.reporting.record import Record
 
 PACKAGE = Path(__file__).resolve().parents[1]
 # The modules that compute an arm's numbers; what they import belongs to it, up to the boundary.
-_ROOTS = ("corrmat.training.fit", "corrmat.training.recipe", "corrmat.baselines")
+_ROOTS = ("corrmat.training.fit", "corrmat.training.recipe")
 _BOUNDARY = ("corrmat.reporting", "corrmat.training.console", "corrmat.training.loggers")
 _NETWORKS = "corrmat.networks"
+_NOT_TRAINING = ("title", "paper", "baselines", "test_pairs", "scales")  # keys of a recipe
 
 
 def commit() -> str | None:
@@ -65,8 +66,13 @@ def staleness(record: Record, repository: Path) -> str:
             return f"commit {name} is not at hand, so nobody can tell whether the code has changed"
         for path in diff.stdout.split():
             then, now = _git(repository, "show", f"{name}:./{path}"), repository / path
-            same = not then.returncode and now.exists()
-            if not (same and _meaning(path, then.stdout) == _meaning(path, now.read_text())):
+            if then.returncode or not now.exists():
+                changed.add(now.name)
+                continue
+            before, after = (
+                _meaning(path, t, record.scale) for t in (then.stdout, now.read_text())
+            )
+            if before != after:
                 changed.add(now.name)
     return f"changed since: {', '.join(sorted(changed))}" if changed else ""
 
@@ -118,10 +124,15 @@ def _path(module: str, package: Path) -> Path | None:
     return path if path.is_file() else None
 
 
-def _meaning(name: str, text: str) -> object:
-    """Parse a recipe or a module, without comments and docstrings."""
+def _meaning(name: str, text: str, scale: str) -> object:
+    """Parse a recipe, as far as it decides how arms train at a scale, or a module.
+
+    Comments, docstrings, and a recipe's baselines and expected numbers are left out.
+    """
     if name.endswith(".yaml"):
-        return yaml.safe_load(text)
+        recipe = yaml.safe_load(text)
+        layer = (recipe.get("scales") or {}).get(scale)
+        return {k: v for k, v in recipe.items() if k not in _NOT_TRAINING} | {"scales": layer}
     tree = ast.parse(text)
     for node in ast.walk(tree):
         documented = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)

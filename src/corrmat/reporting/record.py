@@ -133,7 +133,7 @@ class Record:
     @property
     def place(self) -> Path:
         """Folder of the record below results/, and of its runs below runs/."""
-        return Path(self.scale, self.data, self.id)
+        return place_of(self.scale, self.data, self.id, self.seed)
 
     @property
     def compared(self) -> list[str]:
@@ -157,15 +157,20 @@ class Record:
         return Record(**fields)  # pyright: ignore[reportArgumentType] (our own file)
 
 
+def place_of(scale: str, data: str, identity: str, seed: int) -> Path:
+    """Return the folder of an experiment below results/ and runs/; seed 0 goes without saying."""
+    return Path(scale, data, identity if seed == 0 else f"{identity}-seed{seed}")
+
+
 def read_record(path: Path) -> Record:
     """Read a metrics.json."""
     return Record.from_json(json.loads(path.read_text()))
 
 
 def read_records(results: Path, scale: str = "*") -> list[Record]:
-    """Read every record below a folder, ordered by scale, experiment and data."""
+    """Read every record below a folder, ordered by scale, experiment, data and seed."""
     records = [read_record(path) for path in results.glob(f"{scale}/*/*/metrics.json")]
-    return sorted(records, key=lambda r: (r.scale, r.id, r.data))
+    return sorted(records, key=lambda r: (r.scale, r.id, r.data, r.seed))
 
 
 def read_snapshots(folder: Path) -> list[PairSnapshot]:

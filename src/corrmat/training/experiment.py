@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from corrmat.baselines import BASELINES, UNTRAINED
+from corrmat.baselines import BASELINES, OPTIONAL, UNTRAINED, is_available
 from corrmat.data.datamodule import PairDataset
 from corrmat.files import ensure_writable
 from corrmat.losses import CorrespondenceLoss
@@ -75,6 +75,9 @@ def run(
     if not is_first_process():
         return None
     for name in recipe.baselines:
+        if not is_available(name):
+            log.info(f"the baseline {name} is left out: pip install {OPTIONAL[name]}")
+            continue
         tests, baseline_results[name] = _test(_baseline(name, arms[-1]), arms[-1], recipe)
         rows += pair_rows(name, tests)
     record = Record(

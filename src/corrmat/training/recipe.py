@@ -21,7 +21,7 @@ from corrmat.data.datamodule import RegistrationDataModule, data_name
 from corrmat.errors import CorrmatError
 from corrmat.methods import METHODS
 from corrmat.module import OptimizerSettings
-from corrmat.reporting.record import ArmResult
+from corrmat.reporting.record import ArmResult, place_of
 
 SCALES = ("smoke", "laptop", "overnight", "paper")
 GROUPS = ("data", "network", "loss", "optimizer", "trainer")
@@ -94,7 +94,11 @@ class Recipe:
     @property
     def place(self) -> Path:
         """Folder of the record below results/, and of the runs below runs/."""
-        return Path(self.scale, self.data, self.id)
+        return self.place_of(self.id)
+
+    def place_of(self, identity: str) -> Path:
+        """Return the folder of another experiment of the same scale, data and seed."""
+        return place_of(self.scale, self.data, identity, next(iter(self.arms.values())).seed)
 
 
 def load(

@@ -35,7 +35,7 @@ class TrainedArm:
 def arm_folders(recipe: Recipe, arm: str, runs: Path) -> list[Path]:
     """List the folders of an arm: of this experiment, and of the one named by `networks_of`."""
     identities = filter(None, (recipe.id, recipe.networks_of))
-    return [runs / recipe.scale / recipe.data / identity / arm for identity in identities]
+    return [runs / recipe.place_of(identity) / arm for identity in identities]
 
 
 def training_settings(arm: Arm) -> str:

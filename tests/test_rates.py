@@ -1,0 +1,43 @@
+"""The learning-rate sweep, and that the recipes train at the rates that it chose."""
+
+import json
+
+import pytest
+from conftest import ROOT
+
+from corrmat.errors import CorrmatError
+from corrmat.training import rates, recipe
+
+SWEPT = sorted((ROOT / "results" / "rates").glob("*.json"))
+
+
+def load(identity, scale):
+    return recipe.load(ROOT / "configs" / "exp" / f"{identity}.yaml", scale)
+
+
+def test_every_arm_is_trained_at_the_same_three_factors_and_the_best_is_chosen(tmp_path):
+    swept = rates.sweep(load("1.2", "smoke"), tmp_path / "results", tmp_path / "runs")
+    record = json.loads((tmp_path / "results" / "rates" / "1.2.json").read_text())
+    assert list(record["arms"]) == ["DCP", "DCP_corr"]
+    for arm, results in swept.items():
+        assert [rate.lr for rate in results] == [0.00067, 0.002, 0.006]
+        assert len({rate.rotation_error_deg_mean for rate in results}) > 1  # the rate was used
+        best = min(results, key=lambda rate: rate.rotation_error_deg_mean)
+        assert record["arms"][arm]["chosen"] == best.lr
+
+
+def test_an_arm_at_a_steady_rate_keeps_the_papers(tmp_path):
+    with pytest.raises(CorrmatError, match="no arm with a rate to choose"):
+        rates.sweep(load("1.2", "paper"), tmp_path, tmp_path)
+
+
+@pytest.mark.parametrize("path", SWEPT, ids=lambda path: path.stem)
+@pytest.mark.parametrize("scale", ["laptop", "overnight"])
+def test_the_recipes_train_at_the_chosen_rates(path, scale):
+    arms = load(path.stem, scale).arms
+    for arm, result in json.loads(path.read_text())["arms"].items():
+        assert arms[arm].optimizer.lr == pytest.approx(result["chosen"], rel=0.02)
+
+
+def test_there_is_a_sweep_of_every_family():
+    assert {"1.2", "2.2", "3.2", "outliers"} <= {path.stem for path in SWEPT}
