@@ -48,6 +48,8 @@ protocols: .venv/ready  ## the shipped weights beside the classical pipelines (p
 docs: .venv/ready  ## rewrite the documents' tables, redraw the pictures of docs/ and results/, from results/
 	$(BIN)/corrmat report --docs .
 	$(BIN)/corrmat data --sheet docs/shapes.png
+	$(BIN)/corrmat example runs/example > /dev/null
+	$(BIN)/corrmat register runs/example/source.ply runs/example/target.ply --gif docs/register.gif
 
 report: .venv/ready  ## report.html: every record on one page
 	$(BIN)/corrmat report -o report.html

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import shared
+from PIL import Image
 
 import corrmat
 from corrmat.cli import main
@@ -172,8 +173,12 @@ def test_many_points_are_subsampled_evenly():
 def test_the_command_writes_what_it_promises(pair, tmp_path, capsys):
     folder, source, target, truth = pair
     out, result, html = (tmp_path / name for name in ("aligned.ply", "T.json", "view.html"))
+    gif = tmp_path / "view.gif"
     words = [str(folder / "source.ply"), str(folder / "target.ply"), "-o", str(out)]
-    assert main(["register", *words, "--json", str(result), "--html", str(html)]) == 0
+    assert (
+        main(["register", *words, "--json", str(result), "--html", str(html), "--gif", str(gif)])
+        == 0
+    )
     shown = capsys.readouterr().out
     for word in (
         "matrix",
@@ -192,6 +197,11 @@ def test_the_command_writes_what_it_promises(pair, tmp_path, capsys):
     transform = np.array(content["transform"])
     assert angle_deg(transform, truth) < 2
     assert np.allclose(read_scan(out), source @ transform[:3, :3].T + transform[:3, 3])
+    with Image.open(gif) as animation:
+        assert animation.n_frames == 54
+        first, last = (np.asarray(_frame(animation, at)) for at in (0, 53))
+    assert (first != last).any()
+    assert gif.stat().st_size < 1.5e6
     assert 1e6 < html.stat().st_size < 8e6
     assert "http" not in html.read_text().split("<script", 1)[0]
 
@@ -272,6 +282,11 @@ def test_shipped_weights_are_small_and_hold_no_pickle():
     content = SHIPPED.read_bytes()
     assert len(content) < 8e6
     assert content[8:9] == b"{"  # safetensors: a length, then JSON
+
+
+def _frame(animation, at):
+    animation.seek(at)
+    return animation.convert("RGB")
 
 
 @pytest.mark.parametrize("model", ["ransac", "fgr"])

@@ -89,9 +89,11 @@ def test_the_figure_is_drawn_the_same_twice(tmp_path):
 
 def test_panels_show_training_bands_or_the_sweep():
     shown = figures.panels(Record.from_json(RECORD))
-    assert [panel.title for panel in shown][:2] == ["training loss", "correct matches, %"]
+    assert [panel.title for panel in shown][:2] == [
+        "training loss, share of its start", "correct matches, %",
+    ]  # fmt: skip
     assert {panel.xlabel for panel in shown} == {"training pairs seen"}
-    matches = [(c.arm, c.paper, c.y) for c in shown[1].series]
+    matches = [(c.arm, c.source == "paper", c.y) for c in shown[1].series]
     assert matches == [
         ("DCP", False, [10]), ("DCP", True, [5.5, 5.5]),
         ("DCP_corr", False, [10]), ("DCP_corr", True, [99.9, 99.9]),
@@ -102,7 +104,7 @@ def test_panels_show_training_bands_or_the_sweep():
     arms = {arm: entry | bands for arm, entry in RECORD["arms"].items()}
     shown = figures.panels(Record.from_json(RECORD | {"arms": arms, "paper": {"DCP": bands}}))
     assert [panel.title for panel in shown][1] == "rotation MAE (Euler), deg"
-    assert [(c.arm, c.paper, c.x, c.y) for c in shown[1].series] == [
+    assert [(c.arm, c.source == "paper", c.x, c.y) for c in shown[1].series] == [
         ("DCP", False, [15], [2.0]), ("DCP", True, [15], [2.0]), ("DCP_corr", False, [15], [2.0]),
     ]  # fmt: skip
 

@@ -177,7 +177,7 @@ def _compare(options: Namespace) -> int:
 
 def _register(options: Namespace) -> int:
     """Register two files."""
-    for path in (options.output, options.json, options.html):
+    for path in (options.output, options.json, options.html, options.gif):
         if path is not None and not path.parent.is_dir():
             raise CorrmatError(f"no folder {path.parent} to write {path.name} into")
     if options.output is not None and options.output.suffix.lower() != ".ply":
@@ -185,7 +185,7 @@ def _register(options: Namespace) -> int:
             f"the moved source is written as PLY, {options.output} has another suffix"
         )
     from corrmat.data.scans import read_scan, write_ply
-    from corrmat.files import replace_text
+    from corrmat.files import replace_bytes, replace_text
 
     source, target = (read_scan(path, options.seed) for path in (options.source, options.target))
     from corrmat.registration.register import register, to_json, to_text
@@ -206,6 +206,11 @@ def _register(options: Namespace) -> int:
 
         replace_text(options.html, registration_page(registration, source, target))
         print(f"page: {options.html}")
+    if options.gif is not None:
+        from corrmat.registration.animation import registration_gif  # nor does matplotlib
+
+        replace_bytes(options.gif, registration_gif(registration, source, target))
+        print(f"animation: {options.gif}")
     return 0
 
 

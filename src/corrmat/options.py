@@ -243,6 +243,7 @@ def _add_register_options(parser: ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument("--json", type=Path, help="write matrix, confidence and verdict")
     parser.add_argument("--html", type=Path, help="write a page: before, matches, after")
+    parser.add_argument("--gif", type=Path, help="write an animation of the same")
     parser.add_argument(
         "--model", default="corrmat",
         help="corrmat (the shipped weights), icp, ransac, fgr, or a checkpoint file",

@@ -125,6 +125,22 @@ def less_error(evidence: Evidence) -> Claim:
     )
 
 
+def headline(evidence: Evidence) -> list[str]:
+    """Return the cells of README's table: what both arms reached, and the verdict."""
+    record = evidence.record
+    arms = [_text(median_rotation(e), "deg") for e in (evidence.baseline, evidence.treatment)]
+    judged = less_error(evidence)
+    pairs = record.arms[record.treatment].pairs_seen
+    return [
+        f"{record.id} {record.family}, {record.title}",
+        *arms,
+        _text(ratio_of_medians(evidence.baseline, evidence.treatment)),
+        judged.paper.rpartition(": ")[2].removesuffix(" times"),
+        f"{pairs:,} pairs, {record.data}",
+        f"**{judged.verdict}**",
+    ]
+
+
 def sooner(evidence: Evidence) -> Claim:
     """METHOD_corr reaches METHOD's final error after fewer pairs."""
     record, name = evidence.record, "rotation_error_deg_mean"

@@ -8,17 +8,57 @@ from pathlib import Path
 from corrmat.errors import CorrmatError
 from corrmat.files import replace_text
 from corrmat.metrics import ADDS_THRESHOLD
-from corrmat.reporting.claims import markdown_claims
+from corrmat.reporting.claims import headline, markdown_claims, read_evidence
 from corrmat.reporting.record import Record, read_records
 from corrmat.reporting.tables import markdown_row, markdown_summary, markdown_tables
 from corrmat.reporting.writer import draw_record
 from corrmat.weights import shipped_calibration
+
+HEADLINES = ("1.2", "1.3", "2.1", "2.2", "3.2", "outliers")  # experiments of README's table
+_SCALE_ORDER = {"laptop": 0, "overnight": 1, "paper": 2}
 
 
 def claims_table(results: Path) -> str:
     """Build the ledger of claims from the records of every scale but smoke."""
     records = [record for record in read_records(results) if record.scale != "smoke"]
     return markdown_claims(records, results)
+
+
+def headline_table(results: Path) -> str:
+    """Build README's table: six experiments, each by the longest training that is recorded."""
+    heads = [
+        "experiment",
+        "METHOD",
+        "METHOD_corr",
+        "ratio",
+        "the paper's ratio",
+        "trained",
+        "verdict",
+    ]
+    lines = [markdown_row(heads), "|" + "---|" * len(heads)]
+    records = documented_records(results)
+    for identity in HEADLINES:
+        candidates = [record for record in records if record.id == identity]
+        if candidates:
+            best = max(candidates, key=lambda r: (_SCALE_ORDER[r.scale], r.data == "shapes"))
+            lines.append(markdown_row(headline(read_evidence(best, results))))
+    return "\n".join(lines)
+
+
+def rates_table(results: Path) -> str:
+    """Build the table of the learning-rate sweeps: validation error by rate, the choice in bold."""
+    heads = ["experiment", "arm", "pairs", "a third", "the recipe's rate before", "three times"]
+    lines = [markdown_row(heads), "|" + "---|" * len(heads)]
+    for path in sorted(results.glob("rates/*.json")):
+        sweep = json.loads(path.read_text())
+        for arm, result in sweep["arms"].items():
+            cells = []
+            for rate in result["rates"]:
+                cell = f"{rate['lr']:g}: {rate['rotation_error_deg_mean']:.3g} deg"
+                cells.append(f"**{cell}**" if rate["lr"] == result["chosen"] else cell)
+            pairs = f"{result['rates'][0]['pairs_seen']:,}"
+            lines.append(markdown_row([sweep["id"], arm, pairs, *cells]))
+    return "\n".join(lines)
 
 
 def register_table(results: Path) -> str:
@@ -121,8 +161,10 @@ def _bench_row(row: dict[str, float | str]) -> str:
 
 # document, mark in it, content from the records and the folder results/
 TABLES: tuple[tuple[str, str, Callable[[list[Record], Path], str]], ...] = (
-    ("README.md", "results", lambda records, _: markdown_summary(records)),
+    ("README.md", "headline", lambda _, results: headline_table(results)),
     ("README.md", "register", lambda _, results: register_table(results)),
+    ("docs/reproduction.md", "results", lambda records, _: markdown_summary(records)),
+    ("docs/reproduction.md", "rates", lambda _, results: rates_table(results)),
     ("docs/reproduction.md", "tables", lambda records, _: markdown_tables(records)),
     ("docs/claims.md", "claims", lambda _, results: claims_table(results)),
     ("docs/register.md", "networks", lambda _, results: networks_table(results)),

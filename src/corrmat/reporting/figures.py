@@ -3,12 +3,12 @@
 import io
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogFormatter, NullFormatter
+from matplotlib.ticker import EngFormatter, LogFormatter, NullFormatter
 
 from corrmat.files import replace_bytes
 from corrmat.reporting.record import ArmResult, Record, Subset, defined
@@ -22,20 +22,33 @@ PANELS = {
     "PCRNet": ("loss", "match_accuracy", "naive_euler_rmse_deg", "rotation_error_deg_mean"),
 }
 _OTHER_PANELS = ("loss", "match_accuracy", "rotation_error_deg_mean", "translation_rmse")
+_PAIRS = "training pairs seen"
 _BAND_PANELS = ("match_accuracy", "relative_euler_mae_deg", "chamfer")
 _SWEEP_PANELS = ("match_accuracy", "relative_euler_rmse_deg")
-RED, BLUE, GREEN, PURPLE = "#d62728", "#1f77b4", "#2ca02c", "#9467bd"
+# Okabe and Ito's palette, which the colour-blind can tell apart.
+RED, BLUE, GREEN, PURPLE, GREY = "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#999999"
 MAX_LINES = 150  # matches drawn
+Source = Literal["arm", "paper", "baseline"]
+_STYLES: dict[Source, dict[str, Any]] = {
+    "arm": {"linewidth": 1.4},
+    "paper": {"linestyle": ":", "linewidth": 1.4},
+    "baseline": {"linestyle": "--", "linewidth": 1.2},
+}
 
 
 class CurveSeries(NamedTuple):
-    """An arm's values, or those that the paper reports for it."""
+    """An arm's values, those that the paper reports for it, or a baseline's."""
 
     arm: str
     colour: str
     x: list[float]
     y: list[float]
-    paper: bool = False
+    source: Source = "arm"
+
+    @property
+    def label(self) -> str:
+        """The entry in the legend."""
+        return {"arm": "", "paper": "paper, ", "baseline": "guess: "}[self.source] + self.arm
 
 
 class Panel(NamedTuple):
@@ -50,9 +63,9 @@ class Panel(NamedTuple):
 
 def arm_colours(record: Record) -> dict[str, str]:
     """Assign colours as the paper does: METHOD red, METHOD_corr blue, controls others."""
-    colours = dict(zip(record.controls, (GREEN, PURPLE, "#8c564b"), strict=False))
+    colours = dict(zip(record.controls, (GREEN, PURPLE, "#E69F00"), strict=False))
     colours |= {record.treatment: BLUE} | ({record.baseline: RED} if record.baseline else {})
-    return {arm: colours.get(arm, "#7f7f7f") for arm in record.arms}
+    return {arm: colours.get(arm, GREY) for arm in record.arms}
 
 
 def panels(record: Record) -> list[Panel]:
@@ -72,7 +85,7 @@ def panels(record: Record) -> list[Panel]:
 
 def _training_panel(record: Record, name: str) -> Panel:
     """Describe the curves of one validation metric (or of the training loss)."""
-    title, _, factor = METRICS.get(name, ("training loss", "", 1))
+    title, _, factor = METRICS.get(name, ("training loss, share of its start", "", 1))
     series: list[CurveSeries] = []
     lengths = []
     for arm, colour, result in _arms(record):
@@ -80,15 +93,24 @@ def _training_panel(record: Record, name: str) -> Panel:
         lengths.append(max(pairs, default=1))
         values = [defined(point.get(name)) for point in result.curve]
         if pairs and None not in values:
-            y = [factor * value for value in values if value is not None]
+            unit = (
+                1 / values[0] if name == "loss" and values[0] else factor
+            )  # losses differ in unit
+            y = [unit * value for value in values if value is not None]
             series.append(CurveSeries(arm, colour, pairs, y))
         final = record.paper[arm].get(name) if arm in record.paper else None
         if pairs and final is not None:
             ends = [min(pairs[0], pairs[-1] // 2), pairs[-1]]
-            series.append(CurveSeries(arm, colour, ends, [factor * final] * 2, paper=True))
-    log_x = max(lengths) > 4 * min(lengths)  # PCRNet's arms get equal minutes, not equal pairs
+            series.append(CurveSeries(arm, colour, ends, [factor * final] * 2, "paper"))
+    guess = record.baselines.get("identity", ArmResult({})).get(name)
+    if series and guess:
+        x = [s.x[i] for s in series for i in (0, -1)]
+        series.append(
+            CurveSeries("identity", GREY, [min(x), max(x)], [factor * guess] * 2, "baseline")
+        )
+    log_x = max(lengths) > 4 * min(lengths)  # laptop's PCRNet: equal minutes, not equal pairs
     log_y = name not in ("loss", "match_accuracy")
-    return Panel(title, "training pairs seen", log_x, log_y, series)
+    return Panel(title, _PAIRS, log_x, log_y, series)
 
 
 def _subset_panel(record: Record, name: str, part: str) -> Panel:
@@ -96,13 +118,14 @@ def _subset_panel(record: Record, name: str, part: str) -> Panel:
     title, _, factor = METRICS[name]
     series: list[CurveSeries] = []
     for arm, colour, result in _arms(record):
-        for source, paper in ((result, False), (record.paper.get(arm), True)):
-            subsets: list[Subset] = getattr(source, part) if source else []
+        sources: dict[Source, ArmResult | None] = {"arm": result, "paper": record.paper.get(arm)}
+        for source, values in sources.items():
+            subsets: list[Subset] = getattr(values, part) if values else []
             points = [(s.position, defined(s.metrics.get(name))) for s in subsets]
             available = [(x, factor * y) for x, y in points if y is not None]
             if available:
                 x, y = map(list, zip(*available, strict=True))
-                series.append(CurveSeries(arm, colour, x, y, paper))
+                series.append(CurveSeries(arm, colour, x, y, source))
     xlabel = "initial misalignment, deg" if part == "bands" else "outliers in the test, %"
     return Panel(title, xlabel, False, name != "match_accuracy", series)
 
@@ -115,8 +138,8 @@ def _arms(record: Record) -> Iterator[tuple[str, str, ArmResult]]:
 
 def grid(number: int) -> tuple[int, int]:
     """Return rows and columns for this number of panels."""
-    rows = -(-number // 4)
-    return rows, -(-number // rows)
+    columns = 2 if number in (2, 4) else min(number, 3)
+    return -(-number // columns), columns
 
 
 class _PlainLogFormatter(LogFormatter):
@@ -130,13 +153,15 @@ def draw_curves(record: Record, path: Path) -> None:
     """Draw `panels` of a record as a PNG; the paper's values are dotted."""
     all_panels = panels(record)
     rows, columns = grid(len(all_panels))
-    figure = Figure(figsize=(3.75 * columns, 3.6 * rows + 0.4), layout="constrained")
+    figure = Figure(figsize=(3.75 * columns, 3.2 * rows + 0.6), layout="constrained")
     figure.suptitle(f"{record.id}  {record.title}  ({record.scale}, {record.data})")
     for axes, panel in zip(figure.subplots(rows, columns).flat, all_panels, strict=True):
         for series in panel.series:
-            style = {"linestyle": ":", "linewidth": 1} if series.paper else {"marker": "."}
-            label = f"paper, {series.arm}" if series.paper else series.arm
-            axes.plot(series.x, series.y, color=series.colour, label=label, **style)
+            marker = "." if series.source == "arm" and len(series.x) <= 40 else ""
+            style = _STYLES[series.source] | {"marker": marker}
+            axes.plot(series.x, series.y, color=series.colour, label=series.label, **style)
+        if panel.xlabel == _PAIRS:
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         if panel.log_x:
             axes.set_xscale("log")
             axes.xaxis.set_minor_formatter(NullFormatter())

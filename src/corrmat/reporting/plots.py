@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from corrmat.reporting.figures import BLUE, GREEN, RED, arm_colours, grid, panels
+from corrmat.reporting.figures import BLUE, GREEN, GREY, RED, arm_colours, grid, panels
 from corrmat.reporting.record import Record
 from corrmat.reporting.snapshots import PairSnapshot, Stage, stages
 
@@ -31,12 +31,12 @@ def curves_plot(record: Record) -> Plot:
     for index, panel in enumerate(all_panels):
         suffix = "" if index == 0 else str(index + 1)
         for series in panel.series:
-            in_legend = all(trace.get("name") != series.arm for trace in data)
-            label: Plot = {"name": series.arm, "showlegend": in_legend}
+            in_legend = all(trace.get("name") != series.label for trace in data)
+            label: Plot = {"name": series.label, "showlegend": in_legend}
             line = {"color": series.colour}
-            if series.paper:
-                label = {"name": f"paper, {series.arm}", "mode": "lines", "showlegend": False}
-                line["dash"] = "dot"
+            if series.source != "arm":
+                label = {"name": series.label, "mode": "lines", "showlegend": False}
+                line["dash"] = "dot" if series.source == "paper" else "dash"
             axes = {"xaxis": f"x{suffix}", "yaxis": f"y{suffix}", "legendgroup": series.arm}
             data.append(axes | {"x": series.x, "y": series.y, "line": line} | label)
         for axis, log, text in (("x", panel.log_x, panel.xlabel), ("y", panel.log_y, panel.title)):
@@ -60,7 +60,7 @@ def errors_plot(per_pair: Path, record: Record) -> Plot:
     data = []
     for arm, values in errors.items():
         quantiles = np.quantile(np.nan_to_num(values, nan=180.0), QUANTILES, method="inverted_cdf")
-        style = {"color": colours.get(arm, "#888"), "dash": "solid" if arm in colours else "dash"}
+        style = {"color": colours.get(arm, GREY), "dash": "solid" if arm in colours else "dash"}
         x = [float(f"{max(value, 1e-4):.4g}") for value in quantiles]
         share = (100 * QUANTILES).round(1).tolist()
         data.append({"x": x, "y": share, "name": arm, "line": style})

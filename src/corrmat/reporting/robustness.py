@@ -19,7 +19,7 @@ from corrmat.data.pairs import Key, generator
 from corrmat.files import replace_text
 from corrmat.metrics import rotation_error_deg
 from corrmat.ops.rigid import axis_angle_to_matrix, procrustes
-from corrmat.reporting.figures import save
+from corrmat.reporting.figures import BLUE, RED, save
 
 PERCENT = (1, 5, 10, 15, 20, 25, 30, 40, 50, 60, 70, 80, 90, 95, 99)
 SIZES = (64, 512, 1024, 4096)
@@ -153,8 +153,8 @@ def draw_figure(result: Robustness, path: Path) -> None:
     canvas = Figure(figsize=(11, 4.2), layout="constrained")
     left, right = canvas.subplots(1, 2)
     main = (
-        (f"{SHOWN} points", "#1f77b4", "matches", f"correspondence matrix ({SHOWN} points)"),
-        ("rotation vector", "#d62728", "rotation vector", "rotation vector"),
+        (f"{SHOWN} points", BLUE, "matches", f"correspondence matrix ({SHOWN} points)"),
+        ("rotation vector", RED, "rotation vector", "rotation vector"),
     )
     for name, colour, paper, label in main:
         curve = result.curves[name]

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from wandb.sdk.wandb_run import Run
 
 Choice = Literal["none", "csv", "wandb"]
-_GREEN, _RED, _BLUE = (44, 160, 44), (214, 39, 40), (31, 119, 180)
+_GREEN, _RED, _BLUE = (0, 158, 115), (213, 94, 0), (0, 114, 178)
 
 
 def make_loggers(

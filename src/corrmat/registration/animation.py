@@ -1,0 +1,114 @@
+"""An animated GIF of a registration: two clouds, their matches, and the source as it moves."""
+
+import io
+from collections.abc import Iterator
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from corrmat.registration.register import Registration
+from corrmat.reporting.figures import BLUE, GREEN, GREY, RED
+
+MAX_POINTS = 900  # drawn of a cloud
+MAX_LINES = 60  # strongest matches drawn
+BEFORE, MATCHES, MOVING, AFTER = 8, 12, 20, 14  # frames
+FRAME_MS = 100
+SIZE_INCHES, DPI = (7.2, 3.8), 80
+TURN_DEG, ELEVATION_DEG = 40.0, 20.0  # of the camera; it turns over the whole animation
+
+
+def registration_gif(registration: Registration, source: np.ndarray, target: np.ndarray) -> bytes:
+    """Draw the GIF of a registration: the clouds as they lie, their matches, and the motion.
+
+    Args:
+        registration: of the source onto the target.
+        source: (N, 3 or more), as given to `register`.
+        target: (M, 3 or more).
+    """
+    frames = [image.quantize(64) for image in _frames(registration, source, target)]
+    content = io.BytesIO()
+    frames[0].save(
+        content, "GIF", save_all=True, append_images=frames[1:], duration=FRAME_MS, loop=0,
+        optimize=True,
+    )  # fmt: skip
+    return content.getvalue()
+
+
+def _frames(
+    registration: Registration, source: np.ndarray, target: np.ndarray
+) -> Iterator[Image.Image]:
+    """Draw frame by frame, seen so that the target is as wide as it can be."""
+    view, centre = _principal_axes(target[:, :3]), target[:, :3].mean(0)
+    rotation, translation = registration.transform[:3, :3], registration.transform[:3, 3]
+    fixed = (target[:, :3] - centre) @ view
+    aligned = (source[:, :3] @ rotation.T + translation - centre) @ view
+    turn_back = Rotation.from_matrix(view.T @ rotation.T @ view).as_rotvec()
+    middle = aligned.mean(0)
+    beside = np.array([np.ptp(fixed, axis=0).max() + np.ptp(aligned, axis=0).max(), 0, 0]) * 0.6
+
+    def at(progress: float) -> np.ndarray:
+        """Return the source: turned as given, beside the target (0), to aligned (1)."""
+        left = 1 - progress
+        return (
+            (aligned - middle) @ Rotation.from_rotvec(left * turn_back).as_matrix().T
+            + middle
+            - left * beside
+        )
+
+    start, count = at(0.0), BEFORE + MATCHES + MOVING + AFTER
+    strongest = np.argsort(-registration.match_confidence, kind="stable")[:MAX_LINES]
+    i, j = registration.matches[strongest].T
+    figure = Figure(SIZE_INCHES, DPI)
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.add_axes((0.02, 0.02, 0.96, 0.86))
+    axes.set_axis_off()
+    axes.set_aspect("equal")
+    cameras = [_camera(TURN_DEG * (share - 0.5)).T for share in np.linspace(0, 1, count)]
+    corners = np.vstack([start, fixed, aligned])
+    corners = np.vstack([corners @ camera for camera in cameras])
+    (left_end, bottom), (right_end, top) = corners.min(0), corners.max(0)
+    axes.set(xlim=(left_end, right_end), ylim=(bottom, top))
+    clouds = [axes.scatter([], [], s=5, c=colour, linewidths=0) for colour in (BLUE, RED)]
+    colours = list(np.where(registration.match_agrees[strongest], GREEN, GREY))
+    lines = LineCollection([], colors=colours, lw=0.7, alpha=0.8)
+    axes.add_collection(lines)
+    title = figure.suptitle("", y=0.97, fontsize=13)
+    for frame, camera in enumerate(cameras):
+        share = float(np.clip((frame - BEFORE - MATCHES) / MOVING, 0, 1))
+        moved = at(share**2 * (3 - 2 * share))  # starts and stops slowly
+        clouds[0].set_offsets(_few(fixed) @ camera)
+        clouds[1].set_offsets(_few(moved) @ camera)
+        shown = BEFORE <= frame <= BEFORE + MATCHES
+        lines.set_segments(list(np.stack([moved[i], fixed[j]], 1) @ camera) if shown else [])
+        if frame < BEFORE:
+            title.set_text("source (orange) and target (blue)")
+        elif shown:
+            title.set_text(f"{len(i)} of the matches; green ones agree with the motion")
+        elif share < 1:
+            title.set_text(f"rotated by {registration.rotation_deg:.0f}°")
+        else:
+            title.set_text(f"{registration.verdict}, confidence {registration.confidence:.0%}")
+        canvas.draw()
+        yield Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+
+
+def _camera(azimuth_deg: float) -> np.ndarray:
+    """Return the projection (2, 3) onto the picture: x, and height seen from slightly above."""
+    turn = Rotation.from_euler("zx", [azimuth_deg, ELEVATION_DEG], degrees=True).as_matrix()
+    return turn[[0, 2]]
+
+
+def _few(cloud: np.ndarray) -> np.ndarray:
+    """Thin a cloud (N, 3) evenly."""
+    return cloud[np.linspace(0, len(cloud) - 1, min(MAX_POINTS, len(cloud))).astype(int)]
+
+
+def _principal_axes(points: np.ndarray) -> np.ndarray:
+    """Return the axes (3, 3), columns, of largest, least and middle extent: x, depth, height."""
+    _, _, rows = np.linalg.svd(points - points.mean(0), full_matrices=False)
+    view = rows[[0, 2, 1]].T
+    return view * [1, np.linalg.det(view), 1]
