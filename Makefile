@@ -16,7 +16,7 @@ OPTIONS = --scale $(SCALE) --data.data $(DATA) $(if $(ROOT),--data.root "$(ROOT)
 # What a cluster has trained anew is not trained a second time to be tested.
 RUN_OPTIONS = $(OPTIONS) $(if $(filter ray,$(LAUNCHER)),$(filter-out --fresh,$(ARGS)),$(ARGS))
 
-.PHONY: help $(EXPERIMENTS) outliers robustness all on-ray rates weights protocols docs report bench lint format test test-slow test-oldest lock clean
+.PHONY: help $(EXPERIMENTS) outliers robustness all on-ray rates weights checkpoints protocols docs report bench lint format test test-slow test-oldest lock clean
 
 help:  ## list the targets
 	@echo "make TARGET [SCALE=smoke|laptop|overnight|paper] [DATA=shapes|modelnet40|folder] [ROOT=folder] [NAME=chairs] [ARGS='--key value']"
@@ -41,6 +41,9 @@ rates: .venv/ready  ## three learning rates for every arm, a twentieth of SCALE'
 
 weights: .venv/ready  ## train what `corrmat register` ships on the embedded shapes, put it into the package
 	$(BIN)/python reproduce/weights.py --scale $(SCALE) $(ARGS)
+
+checkpoints: .venv/ready  ## put the trained arms of SCALE's records into the package: corrmat.load_model("1.2/DCP_corr")
+	$(BIN)/python reproduce/checkpoints.py $(OPTIONS)
 
 protocols: .venv/ready  ## the shipped weights beside the classical pipelines (pip install open3d), into results/register
 	$(BIN)/python benchmarks/protocols.py $(if $(ROOT),--root "$(ROOT)")

@@ -65,6 +65,21 @@ def sweep_rates(experiments: Sequence[str]) -> None:
         sys.exit(f"corrmat: error: {error}")
 
 
+def ship_arms() -> None:
+    """Put the trained arms of recorded experiments into the package: reproduce/checkpoints.py."""
+    try:
+        options = parse(["run", *sys.argv[1:]])
+        from corrmat.training import recipe, shipping
+
+        paths = [options.config] if options.config else sorted(_config_folder().glob("*.yaml"))
+        for path in paths:
+            loaded = recipe.load(path, options.scale, options.overrides)
+            for name in shipping.ship(loaded, options.results, options.runs):
+                print(f"shipped: {name}")
+    except CorrmatError as error:
+        sys.exit(f"corrmat: error: {error}")
+
+
 def train_weights(recipe: Path) -> None:
     """Train the weights that `corrmat register` ships: reproduce/weights.py.
 

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from corrmat.errors import CorrmatError
+from corrmat.files import replace_bytes
 from corrmat.networks.dcp import DCPNetwork
 from corrmat.networks.invariant import InvariantNetwork
 from corrmat.networks.pcrnet import PCRNetCorrNetwork, PCRNetwork
@@ -97,13 +98,19 @@ def load_reference(kind: str, state_dict: Mapping[str, Any], **hparams: Any) -> 
 SHIPPED = Path(__file__).parent / "shipped" / "corrmat.safetensors"
 
 
+def shipped_models() -> list[str]:
+    """List the trained arms of experiments that ship with the package, e.g. "1.2/DCP_corr"."""
+    files = SHIPPED.parent.glob("*/*.safetensors")
+    return sorted(file.relative_to(SHIPPED.parent).with_suffix("").as_posix() for file in files)
+
+
 def load_model(model: str | Path = "corrmat") -> nn.Module:
     """Load a trained network, in evaluation mode.
 
     Args:
-        model: "corrmat" for the weights that ship with the package; or a file: a checkpoint of
-            `corrmat fit`, or the original authors' .t7 or .pth of DCP, RPMNet, PCRNet or
-            PCRNet_corr.
+        model: "corrmat" for the weights that `corrmat register` uses; one of `shipped_models`,
+            e.g. "1.2/DCP_corr"; or a file: a checkpoint of `corrmat fit`, or the original
+            authors' .t7 or .pth of DCP, RPMNet, PCRNet or PCRNet_corr.
 
     Raises:
         CorrmatError: there is no such file, it holds anything but tensors, or they fit no
@@ -112,6 +119,12 @@ def load_model(model: str | Path = "corrmat") -> nn.Module:
     if str(model) == "corrmat":
         network = InvariantNetwork(**json.loads(shipped_metadata()["network"]))
         return _load_state(network, safetensors.torch.load_file(SHIPPED))
+    if str(model) in shipped_models():
+        from corrmat.methods import METHODS  # imports Lightning, which `register` does not need
+
+        about = shipped_metadata(str(model))
+        network = METHODS[about["method"]].network_type(**json.loads(about["network"]))
+        return _load_state(network, safetensors.torch.load_file(_shipped_file(str(model))))
     path = Path(model)
     content = _read_checkpoint(path)
     if "method" in content:
@@ -120,10 +133,38 @@ def load_model(model: str | Path = "corrmat") -> nn.Module:
     return load_reference(_kind_of(path, state), state)
 
 
-def shipped_metadata() -> dict[str, str]:
-    """Read the header of the shipped weights: method, network, commit, calibration."""
-    with safetensors.safe_open(SHIPPED, framework="pt") as file:
+def shipped_metadata(model: str = "corrmat") -> dict[str, str]:
+    """Read the header of shipped weights: method, network, commit, and what goes with them.
+
+    Args:
+        model: "corrmat" (with its calibration), or one of `shipped_models` (with its record).
+    """
+    with safetensors.safe_open(_shipped_file(model), framework="pt") as file:
         return file.metadata()
+
+
+def _shipped_file(model: str) -> Path:
+    return SHIPPED.parent / f"{model}.safetensors"
+
+
+def ship_network(
+    model: str, method: str, hparams: Mapping[str, Any], network: nn.Module, **about: str
+) -> Path:
+    """Write a network's weights into the package.
+
+    Args:
+        model: its name for `load_model`.
+        method: key of `METHODS`.
+        hparams: of the network.
+        network: trained.
+        about: what else the header says.
+    """
+    path = _shipped_file(model)
+    state = {name: tensor.contiguous() for name, tensor in network.state_dict().items()}
+    metadata = {"method": method, "network": json.dumps(dict(hparams)), **about}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    replace_bytes(path, safetensors.torch.save(state, metadata))
+    return path
 
 
 @dataclass(frozen=True)
@@ -160,7 +201,8 @@ def _read_checkpoint(path: Path) -> Mapping[str, Any]:
     """Read a file with torch's loader for weights only."""
     if not path.is_file():
         raise CorrmatError(
-            f"no model {str(path)!r}: neither corrmat, icp, ransac, fgr nor a checkpoint file"
+            f"no model {str(path)!r}: neither corrmat, {', '.join(shipped_models())}, icp, ransac, "
+            "fgr nor a checkpoint file"
         )
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)

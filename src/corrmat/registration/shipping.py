@@ -4,11 +4,9 @@ import json
 from pathlib import Path
 
 import numpy as np
-import safetensors.torch
 from scipy.optimize import minimize
 
 from corrmat import weights
-from corrmat.files import replace_bytes
 from corrmat.metrics import ADDS_THRESHOLD
 from corrmat.registration import benchmark
 from corrmat.reporting.provenance import commit
@@ -26,16 +24,11 @@ def ship(checkpoint: Path) -> None:
     """
     method, hparams, network = weights.checkpoint_network(checkpoint)
     calibration = calibrate(checkpoint)
-    state = {name: tensor.contiguous() for name, tensor in network.state_dict().items()}
-    metadata = {
-        "method": method,
-        "network": json.dumps(hparams),
-        "commit": str(commit()),
-        "calibration": json.dumps(calibration),
-    }
-    weights.SHIPPED.parent.mkdir(exist_ok=True)
-    replace_bytes(weights.SHIPPED, safetensors.torch.save(state, metadata))
-    print(f"{weights.SHIPPED}: {weights.SHIPPED.stat().st_size / 1e6:.1f} MB")
+    path = weights.ship_network(
+        "corrmat", method, hparams, network,
+        commit=str(commit()), calibration=json.dumps(calibration),
+    )  # fmt: skip
+    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
 
 
 def calibrate(checkpoint: Path) -> dict[str, list[float]]:
