@@ -11,7 +11,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from corrmat.registration.register import Registration
-from corrmat.reporting.figures import BLUE, GREEN, GREY, RED
+from corrmat.reporting.figures import BLUE, GREEN, GREY, RED, principal_axes
 
 MAX_POINTS = 900  # drawn of a cloud
 MAX_LINES = 60  # strongest matches drawn
@@ -42,7 +42,7 @@ def _frames(
     registration: Registration, source: np.ndarray, target: np.ndarray
 ) -> Iterator[Image.Image]:
     """Draw frame by frame, seen so that the target is as wide as it can be."""
-    view, centre = _principal_axes(target[:, :3]), target[:, :3].mean(0)
+    view, centre = principal_axes(target[:, :3]), target[:, :3].mean(0)
     rotation, translation = registration.transform[:3, :3], registration.transform[:3, 3]
     fixed = (target[:, :3] - centre) @ view
     aligned = (source[:, :3] @ rotation.T + translation - centre) @ view
@@ -105,10 +105,3 @@ def _camera(azimuth_deg: float) -> np.ndarray:
 def _few(cloud: np.ndarray) -> np.ndarray:
     """Thin a cloud (N, 3) evenly."""
     return cloud[np.linspace(0, len(cloud) - 1, min(MAX_POINTS, len(cloud))).astype(int)]
-
-
-def _principal_axes(points: np.ndarray) -> np.ndarray:
-    """Return the axes (3, 3), columns, of largest, least and middle extent: x, depth, height."""
-    _, _, rows = np.linalg.svd(points - points.mean(0), full_matrices=False)
-    view = rows[[0, 2, 1]].T
-    return view * [1, np.linalg.det(view), 1]

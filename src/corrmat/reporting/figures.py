@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -12,7 +13,7 @@ from matplotlib.ticker import EngFormatter, LogFormatter, NullFormatter
 
 from corrmat.files import replace_bytes
 from corrmat.reporting.record import ArmResult, Record, Subset, defined
-from corrmat.reporting.snapshots import PairSnapshot, Stage, match_accuracy, stages
+from corrmat.reporting.snapshots import PairSnapshot, SnapshotStep, Stage, match_accuracy, stages
 from corrmat.reporting.tables import METRICS
 
 # The columns of the paper's figures 5, 6 and 7, by family.
@@ -177,22 +178,25 @@ def draw_curves(record: Record, path: Path) -> None:
 
 
 def draw_matches(snapshot: PairSnapshot, title: str, path: Path) -> None:
-    """Draw a pair before and after, right matches green and wrong ones red (paper, figure 8).
+    """Draw a pair before and after, right matches green, wrong ones orange (paper, figure 8).
 
-    The source is black and the target blue. Points called outliers have a ring, which is red if
-    they are inliers.
+    The source is black and the target blue. Points called outliers have a ring, which is orange
+    if they are inliers.
 
     Args:
         snapshot: the pair.
         title: above the figure.
         path: of the PNG.
     """
-    before, *_, after = stages(snapshot)
+    before, *_, after = stages(_facing(snapshot))
     boxes = [_box(_project(np.concatenate([s.source, s.target]))) for s in (before, after)]
     widths = [min(max(box[0] / box[1], 1), 3) for box in boxes]  # room for the headings
     height = min(1 + 10 / sum(widths), 6)
     figure = Figure(figsize=(10, height), layout="constrained")
-    figure.suptitle(f"{title}: {100 * match_accuracy(snapshot):.0f} % of the matches are right")
+    figure.suptitle(
+        f"{title}: {100 * match_accuracy(snapshot):.0f} % of the matches are right, "
+        f"rotation {snapshot.rotation_error_deg:.2g} deg off"
+    )
     headings = "source, target set aside, matches", "registered"
     both = figure.subplots(1, 2, width_ratios=widths)
     for axes, stage, heading in zip(both, (before, after), headings, strict=True):
@@ -211,6 +215,31 @@ def draw_matches(snapshot: PairSnapshot, title: str, path: Path) -> None:
         axes.set_axis_off()
     both[1].legend(fontsize="x-small", loc="best")
     save(figure, path)
+
+
+def principal_axes(points: np.ndarray) -> np.ndarray:
+    """Return the axes (3, 3), columns, of points' (N, 3) largest, least and middle extent.
+
+    With them as x, depth and height no view is edge-on.
+    """
+    _, _, rows = np.linalg.svd(points - points.mean(0), full_matrices=False)
+    view = rows[[0, 2, 1]].T
+    return view * [1, np.linalg.det(view), 1]
+
+
+def _facing(snapshot: PairSnapshot) -> PairSnapshot:
+    """Turn a pair so that the principal axes of the target are those of the picture."""
+    view = principal_axes(np.asarray(snapshot.target))
+    steps = [
+        SnapshotStep(
+            (view.T @ np.asarray(step.rotation) @ view).tolist(),
+            (np.asarray(step.translation) @ view).tolist(),
+            step.matched,
+        )
+        for step in snapshot.steps
+    ]
+    source, target = (np.asarray(c) @ view for c in (snapshot.source, snapshot.target))
+    return replace(snapshot, source=source.tolist(), target=target.tolist(), steps=steps)
 
 
 def _match_lines(stage: Stage, source: np.ndarray, target: np.ndarray) -> LineCollection:
