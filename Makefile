@@ -60,8 +60,8 @@ report: .venv/ready  ## report.html: every record on one page
 bench: .venv/ready  ## speed: pairs a second, training steps, ratios against a naive twin
 	$(BIN)/python benchmarks/bench.py
 
-lint: .venv/ready  ## ruff, pyright, and the layers that imports keep to
-	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/pyright && $(BIN)/lint-imports
+lint: .venv/ready  ## ruff, pyright, codespell, and the layers that imports keep to
+	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/pyright && $(BIN)/lint-imports && $(BIN)/codespell
 
 format: .venv/ready  ## let ruff rewrite what it can
 	$(BIN)/ruff check --fix . && $(BIN)/ruff format .

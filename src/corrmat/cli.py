@@ -8,7 +8,7 @@ from pathlib import Path
 from jsonargparse import Namespace
 
 from corrmat.errors import CorrmatError
-from corrmat.options import EXPERIMENT_COMMANDS, build_parser, parse
+from corrmat.options import EXPERIMENT_COMMANDS, SHORT_HELP, build_parser, parse
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -100,7 +100,8 @@ def train_weights(recipe: Path) -> None:
 
 def _run_command(words: Sequence[str]) -> int:
     if not words:
-        raise CorrmatError("which command? see corrmat --help")
+        print(SHORT_HELP)
+        return 0
     options = parse(words)
     return _COMMANDS[options.command](options)
 

@@ -9,6 +9,16 @@ from jsonargparse import ArgumentParser, Namespace
 
 from corrmat.errors import CorrmatError
 
+SHORT_HELP = """corrmat: Correspondence Matrices are Underrated (3DV 2020), reproduced.
+
+  corrmat register source.ply target.ply     align two clouds of your own
+  corrmat example pair                       write two scans to try it on
+  corrmat run --config configs/exp/1.2.yaml  train and test both arms of an experiment
+  corrmat data                               make the embedded data set
+  corrmat report -o report.html              all records on one page
+
+corrmat --help lists every command, with examples; corrmat COMMAND --help its options."""
+
 EPILOG = """examples:
   corrmat register source.ply target.ply -o aligned.ply --html view.html
       align two clouds of your own (corrmat example DIR writes two to try)

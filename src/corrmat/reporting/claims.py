@@ -287,6 +287,17 @@ def claims_of(records: Sequence[Record], results: Path) -> list[Claim]:
     return claims + figure_2(results)
 
 
+def verdicts(record: Record, results: Path) -> str:
+    """Judge a record that was just written, claim by claim; empty if it bears on none."""
+    if record.scale == "smoke":
+        return "smoke scale: everything runs, and nothing is learnt"
+    if not set(record.compared) <= set(record.paper):
+        return ""
+    evidence = read_evidence(record, results)
+    claims = (judge(evidence) for judge in JUDGED.get(record.id, ()))
+    return "\n".join(f"{c.verdict}: {c.words}\n    {c.ours}" for c in claims if c is not None)
+
+
 def markdown_claims(records: Sequence[Record], results: Path) -> str:
     """Build the ledger as a Markdown table."""
     heads = ["claim", "paper", "ours", "record", "verdict"]

@@ -14,6 +14,7 @@ from corrmat.files import ensure_writable
 from corrmat.losses import CorrespondenceLoss
 from corrmat.metrics import summary
 from corrmat.module import OptimizerSettings, RegistrationModule
+from corrmat.reporting.claims import verdicts
 from corrmat.reporting.provenance import commit
 from corrmat.reporting.record import ArmResult, Record, Subset
 from corrmat.reporting.snapshots import PairSnapshot, take_snapshot
@@ -21,7 +22,7 @@ from corrmat.reporting.tables import terminal_table
 from corrmat.reporting.writer import pair_rows, write_record
 from corrmat.training import loggers, runs
 from corrmat.training.console import Board
-from corrmat.training.fit import fresh_method, load_trained, score, train
+from corrmat.training.fit import fresh_method, load_trained, score, seconds_to_train, train
 from corrmat.training.hardware import is_first_process
 from corrmat.training.preflight import Arm, prepare
 from corrmat.training.recipe import Recipe
@@ -61,6 +62,11 @@ def run(
     baseline_results: dict[str, ArmResult] = {}
     rows: list[dict[str, object]] = []
     snapshots: list[PairSnapshot] = []
+    if is_first_process():
+        log.info(f"\n{recipe.id}  {recipe.title}  ({recipe.scale}, {recipe.data})")
+        for arm in arms:
+            if fresh or runs.find_trained(recipe, arm, runs_folder) is None:
+                log.info(f"{arm.name}: {_time_to_train(arm)}")
     with Board() as board:
         for arm in arms:
             log.info(f"\n{recipe.id} {arm.name} ({recipe.scale}, {recipe.data})")
@@ -106,7 +112,8 @@ def run(
         logger, runs_folder / recipe.place, record, snapshots, results / recipe.place
     )
     print(terminal_table(record), flush=True)
-    log.info(f"record: {results / recipe.place}")
+    log.info(verdicts(record, results))
+    log.info(f"pictures and record: {results / recipe.place}/curves.png")
     return record
 
 
@@ -125,6 +132,14 @@ def train_or_reuse(
         return trained
     folder = runs_folder / recipe.place / arm.name
     return train(arm, folder, recipe.place.as_posix(), logger, board, fresh=fresh)
+
+
+def _time_to_train(arm: Arm) -> str:
+    """Say how long an arm trains on this machine, as far as a timed step tells."""
+    seconds = seconds_to_train(arm)
+    if seconds is None:
+        return "trains on a GPU, or without a last step: no estimate"
+    return f"about {max(seconds / 60, 0.1):.2g} min of training on this machine"
 
 
 def bands(edges_deg: Sequence[float]) -> list[dict[str, float]]:

@@ -2,6 +2,8 @@
 
 import logging
 import shutil
+import statistics
+import time
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,6 +13,7 @@ import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 from torch import Tensor
 
+from corrmat.data.datamodule import PairDataset
 from corrmat.errors import CorrmatError
 from corrmat.methods import Method
 from corrmat.module import RegistrationModule
@@ -23,6 +26,8 @@ from corrmat.training.hardware import (
     first_device,
     is_first_process,
     keep_freed_memory,
+    on_gpu,
+    resolve_precision,
     trainer_options,
 )
 from corrmat.training.preflight import Arm, build_method
@@ -30,6 +35,7 @@ from corrmat.training.recipe import ArmSettings
 from corrmat.training.runs import TrainedArm
 
 log = logging.getLogger("corrmat")
+_TIMED_STEPS = 3
 MONITOR = "val/rotation_error_deg_mean"  # the best checkpoint has the lowest
 
 
@@ -116,6 +122,31 @@ def fresh_method(settings: ArmSettings) -> Method:
     """Build the method with the weights that its seed gives: where training starts."""
     L.seed_everything(settings.seed, workers=True, verbose=False)
     return build_method(settings)
+
+
+def seconds_to_train(arm: Arm) -> float | None:
+    """Estimate how long an arm trains, from a timed step; None on a GPU, or without a last step."""
+    settings, trainer = arm.settings, arm.settings.trainer
+    steps = trainer.max_steps
+    if steps == -1:
+        steps = (trainer.max_epochs or -1) * len(arm.datamodule.train_dataloader())
+    if steps < 0 or trainer.max_time is not None or on_gpu(trainer.accelerator):
+        return None
+    method = fresh_method(settings)
+    dataset = arm.datamodule.test_dataloader().dataset
+    assert isinstance(dataset, PairDataset)
+    batch = dataset.__getitems__([(0, 0)] * arm.datamodule.batch_size)
+    bfloat16 = resolve_precision(settings) == "bf16-mixed"
+    optimizer = torch.optim.Adam(method.parameters())
+    seconds = []
+    for _ in range(_TIMED_STEPS):
+        start = time.perf_counter()
+        with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
+            prediction = method(batch.source, batch.target)
+        method.loss(prediction, batch).backward()
+        optimizer.step()
+        seconds.append(time.perf_counter() - start)
+    return statistics.median(seconds) * steps
 
 
 def load_trained(arm: Arm, checkpoint: Path) -> Method:
