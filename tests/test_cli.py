@@ -78,7 +78,7 @@ def test_bad_input_is_one_line_and_writes_nothing(options, message, capsys, tmp_
 
 
 @pytest.mark.parametrize(
-    "words", [["fit"], ["nonsense"], ["run", "--scale", "huge"], ["data", "--bogus"], []]
+    "words", [["fit"], ["nonsense"], ["run", "--scale", "huge"], ["data", "--bogus"]]
 )
 def test_bad_commands_exit_with_2(words, capsys):
     try:
@@ -87,6 +87,13 @@ def test_bad_commands_exit_with_2(words, capsys):
         code = stopped.code
     assert code == 2
     assert "Traceback" not in capsys.readouterr().err
+
+
+def test_corrmat_alone_says_what_it_can_do(capsys):
+    assert main([]) == 0
+    shown = capsys.readouterr().out.splitlines()
+    assert 5 < len(shown) < 15
+    assert any("corrmat register source.ply target.ply" in line for line in shown)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ The classical pipelines are Open3D's, over FPFH features (Rusu et al., ICRA 2009
 in units in which a cloud's radius is about one.
 """
 
+import contextlib
 import importlib
 from typing import Any, NamedTuple
 
@@ -59,9 +60,17 @@ class Ransac(nn.Module):
     def forward(self, source: Tensor, target: Tensor) -> Prediction:
         """Register source (B, N, 6) to target (B, M, 6), xyz and unit normal; no correspondence."""
         clouds = zip(source.double().cpu().numpy(), target.double().cpu().numpy(), strict=True)
-        found = np.stack([fpfh_ransac(x, y, self.SEED, refine=True) for x, y in clouds])
+        with _one_thread():
+            found = np.stack([fpfh_ransac(x, y, self.SEED, refine=True) for x, y in clouds])
         transform = torch.from_numpy(found).to(source)
         return Prediction(transform[:, :3, :3], transform[:, :3, 3])
+
+
+def _one_thread() -> contextlib.AbstractContextManager[object]:
+    """Keep Open3D to one thread: on several, RANSAC is not the same twice."""
+    _open3d()  # threads of a library that is loaded later would not be limited
+    threadpoolctl: Any = importlib.import_module("threadpoolctl")
+    return threadpoolctl.threadpool_limits(1)
 
 
 class FpfhSettings(NamedTuple):
@@ -140,14 +149,19 @@ def fpfh_fgr(
     return np.array(result.transformation)
 
 
+def _open3d() -> Any:  # noqa: ANN401
+    """Import Open3D, which not everybody has."""
+    try:
+        return importlib.import_module("open3d")
+    except ImportError as error:
+        raise CorrmatError(f"ransac and fgr are Open3D's: pip install open3d ({error})") from error
+
+
 def _fpfh(
     source: np.ndarray, target: np.ndarray, settings: FpfhSettings
 ) -> tuple[Any, list[Any], list[Any]]:
     """Compute Open3D's clouds and FPFH features; return them behind the open3d module."""
-    try:
-        o3d: Any = importlib.import_module("open3d")
-    except ImportError as error:
-        raise CorrmatError(f"ransac and fgr are Open3D's: pip install open3d ({error})") from error
+    o3d = _open3d()
     clouds, features = [], []
     for points in (source, target):
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[:, :3].astype(float)))
@@ -164,13 +178,14 @@ BASELINES: dict[str, type[nn.Module]] = {
     "identity": Identity, "radius": Radius, "ransac": Ransac,
 }  # fmt: skip
 UNTRAINED = "untrained"  # the baseline that is the arms' own network before training
-OPTIONAL = {"ransac": "open3d"}  # baselines that need a package of the extra `baselines`
+OPTIONAL = {"ransac": ("open3d", "threadpoolctl")}  # packages of the extra `baselines`
 
 
 def is_available(name: str) -> bool:
-    """Tell whether the package that a baseline needs can be imported."""
+    """Tell whether the packages that a baseline needs can be imported."""
     try:
-        importlib.import_module(OPTIONAL.get(name, __name__))
+        for package in OPTIONAL.get(name, ()):
+            importlib.import_module(package)
     except ImportError:
         return False
     return True

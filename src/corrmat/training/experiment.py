@@ -82,7 +82,7 @@ def run(
         return None
     for name in recipe.baselines:
         if not is_available(name):
-            log.info(f"the baseline {name} is left out: pip install {OPTIONAL[name]}")
+            log.info(f"the baseline {name} is left out: pip install {' '.join(OPTIONAL[name])}")
             continue
         tests, baseline_results[name] = _test(_baseline(name, arms[-1]), arms[-1], recipe)
         rows += pair_rows(name, tests)
@@ -129,6 +129,7 @@ def train_or_reuse(
     """Train an arm of an experiment, unless it is trained already."""
     trained = None if fresh else runs.find_trained(recipe, arm, runs_folder)
     if trained is not None:
+        log.info(f"trained already: {trained.checkpoint.parent}")
         return trained
     folder = runs_folder / recipe.place / arm.name
     return train(arm, folder, recipe.place.as_posix(), logger, board, fresh=fresh)

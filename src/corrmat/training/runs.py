@@ -78,7 +78,6 @@ def find_trained(recipe: Recipe, arm: Arm, runs: Path) -> TrainedArm | None:
     main, *others = arm_folders(recipe, arm.name, runs)
     for folder in (*([] if (main / _RECORDED).exists() else [main]), *others):
         if (folder / _TRAINED).is_file() and _same_settings(folder, arm):
-            log.info(f"trained already: {folder}")
             content = json.loads((folder / _TRAINED).read_text())
             return TrainedArm(**content | {"checkpoint": folder / content["checkpoint"]})
     return None
