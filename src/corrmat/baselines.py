@@ -62,7 +62,8 @@ class Ransac(nn.Module):
         clouds = zip(source.double().cpu().numpy(), target.double().cpu().numpy(), strict=True)
         with _one_thread():
             found = np.stack([fpfh_ransac(x, y, self.SEED, refine=True) for x, y in clouds])
-        transform = torch.from_numpy(found).to(source)
+        # Open3D's last bits depend on where its arrays lie in memory.
+        transform = torch.from_numpy(found.round(8)).to(source)
         return Prediction(transform[:, :3, :3], transform[:, :3, 3])
 
 
