@@ -30,6 +30,7 @@ def headline_table(results: Path) -> str:
         "experiment",
         "METHOD",
         "METHOD_corr",
+        "RANSAC",
         "ratio",
         "the paper's ratio",
         "trained",
