@@ -121,7 +121,7 @@ def less_error(evidence: Evidence) -> Claim:
         ours += f"; {record.baseline} stays near the identity guess, {identity}"
     return Claim(
         f"{record.id}: {record.treatment} registers better than {record.baseline} ({record.title})",
-        f"{theirs[0]:g} → {theirs[1]:g} deg: {paper_ratio:.3g} times" if paper_ratio else "",
+        f"{theirs[0]:.3g} → {theirs[1]:.3g} deg: {paper_ratio:.3g} times" if paper_ratio else "",
         ours,
         evidence.where,
         verdict_of_ratio(ratio, paper_ratio, learnt),
@@ -338,6 +338,8 @@ def claims_of(records: Sequence[Record], results: Path) -> list[Claim]:
     """Judge every claim by every record that bears on it."""
     claims = []
     for record in records:
+        if record.id not in JUDGED:
+            continue
         evidence = read_evidence(record, results)
         judged = (judge(evidence) for judge in JUDGED.get(record.id, ()))
         claims += [claim for claim in judged if claim is not None]

@@ -9,6 +9,7 @@ import jinja2
 from plotly.offline import get_plotlyjs
 
 from corrmat.reporting import plots
+from corrmat.reporting.claims import claims_of
 from corrmat.reporting.provenance import command, staleness
 from corrmat.reporting.record import Record, read_records, read_snapshots
 from corrmat.reporting.tables import METRICS, cell, effort, paper_metric, ratio, table
@@ -54,7 +55,7 @@ def build_page(results: Path) -> str:
     Returns:
         HTML with everything in it.
     """
-    records = sorted(read_records(results), key=lambda r: (r.id, r.scale, r.data))
+    records = sorted(read_records(results), key=lambda r: (r.id, r.scale, r.data, r.seed))
     figures: dict[str, plots.Plot] = {}
     sections = []
     for identity, group in itertools.groupby(records, key=lambda r: r.id):
@@ -63,6 +64,7 @@ def build_page(results: Path) -> str:
         articles = [_article(record, results, figures) for record in same]
         sections.append(Section(identity, title, articles))
     return _ENVIRONMENT.get_template("records.html.j2").render(
+        claims=claims_of([r for r in records if r.scale != "smoke"], results),
         summary=[row for record in records for row in _summary_rows(record)],
         sections=sections,
         robustness=_robustness(results, figures),
@@ -141,7 +143,7 @@ def _robustness(results: Path, figures: dict[str, plots.Plot]) -> list[dict[str,
 
 
 def _name(record: Record) -> str:
-    return f"{record.scale}-{record.data}-{record.id}"
+    return "-".join(record.place.parts)
 
 
 def _source(record: Record) -> str:

@@ -14,7 +14,7 @@ Plot = dict[str, object]
 """A plotly figure: `data` and `layout`."""
 QUANTILES = np.linspace(0, 1, 101)
 _TRACES = 5  # of a stage
-_MAX_POINTS, _MAX_LINES = 120, 70  # drawn of a cloud, of the matches: the page stays small
+_MAX_POINTS, _MAX_LINES = 120, 45  # drawn of a cloud, of the matches: the page stays small
 
 
 def curves_plot(record: Record) -> Plot:
