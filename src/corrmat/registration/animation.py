@@ -11,7 +11,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from corrmat.registration.register import Registration
-from corrmat.reporting.figures import BLUE, GREEN, GREY, RED, principal_axes
+from corrmat.reporting.figures import BLUE, GREEN, GREY, RED, principal_axes, thin
 
 MAX_POINTS = 900  # drawn of a cloud
 MAX_LINES = 60  # strongest matches drawn
@@ -80,8 +80,8 @@ def _frames(
     for frame, camera in enumerate(cameras):
         share = float(np.clip((frame - BEFORE - MATCHES) / MOVING, 0, 1))
         moved = at(share**2 * (3 - 2 * share))  # starts and stops slowly
-        clouds[0].set_offsets(_few(fixed) @ camera)
-        clouds[1].set_offsets(_few(moved) @ camera)
+        clouds[0].set_offsets(thin(fixed, MAX_POINTS) @ camera)
+        clouds[1].set_offsets(thin(moved, MAX_POINTS) @ camera)
         shown = BEFORE <= frame <= BEFORE + MATCHES
         lines.set_segments(list(np.stack([moved[i], fixed[j]], 1) @ camera) if shown else [])
         if frame < BEFORE:
@@ -100,8 +100,3 @@ def _camera(azimuth_deg: float) -> np.ndarray:
     """Return the projection (2, 3) onto the picture: x, and height seen from slightly above."""
     turn = Rotation.from_euler("zx", [azimuth_deg, ELEVATION_DEG], degrees=True).as_matrix()
     return turn[[0, 2]]
-
-
-def _few(cloud: np.ndarray) -> np.ndarray:
-    """Thin a cloud (N, 3) evenly."""
-    return cloud[np.linspace(0, len(cloud) - 1, min(MAX_POINTS, len(cloud))).astype(int)]

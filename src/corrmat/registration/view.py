@@ -5,7 +5,7 @@ import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
 from corrmat.registration.register import Registration
-from corrmat.reporting.figures import BLUE, RED
+from corrmat.reporting.figures import BLUE, RED, thin
 
 MAX_POINTS = 4000  # drawn of a cloud
 MAX_LINES = 150  # strongest matches drawn
@@ -53,8 +53,7 @@ def registration_page(registration: Registration, source: np.ndarray, target: np
 
 def _points(cloud: np.ndarray, name: str, colour: str, legend: bool) -> go.Scatter3d:
     """Build the trace of a cloud (N, 3), thinned evenly."""
-    few = cloud[np.linspace(0, len(cloud) - 1, min(MAX_POINTS, len(cloud))).astype(int)]
-    x, y, z = few.astype(np.float32).T
+    x, y, z = thin(cloud, MAX_POINTS).astype(np.float32).T
     return go.Scatter3d(
         x=x,
         y=y,

@@ -335,15 +335,20 @@ def figure_2(results: Path) -> list[Claim]:
 
 
 def claims_of(records: Sequence[Record], results: Path) -> list[Claim]:
-    """Judge every claim by every record that bears on it."""
-    claims = []
-    for record in records:
-        if record.id not in JUDGED:
-            continue
-        evidence = read_evidence(record, results)
-        judged = (judge(evidence) for judge in JUDGED.get(record.id, ()))
-        claims += [claim for claim in judged if claim is not None]
-    return claims + figure_2(results)
+    """Judge every claim by every record that bears on it; smoke records bear on none."""
+    judged = [
+        claim for record in records if record.scale != "smoke" for claim in _judge(record, results)
+    ]
+    return judged + figure_2(results)
+
+
+def _judge(record: Record, results: Path) -> list[Claim]:
+    """Judge the claims that a record bears on."""
+    if record.id not in JUDGED:
+        return []
+    evidence = read_evidence(record, results)
+    claims = (judge(evidence) for judge in JUDGED[record.id])
+    return [claim for claim in claims if claim is not None]
 
 
 def verdicts(record: Record, results: Path) -> str:
@@ -352,9 +357,8 @@ def verdicts(record: Record, results: Path) -> str:
         return "smoke scale: everything runs, and nothing is learnt"
     if not set(record.compared) <= set(record.paper):
         return ""
-    evidence = read_evidence(record, results)
-    claims = (judge(evidence) for judge in JUDGED.get(record.id, ()))
-    return "\n".join(f"{c.verdict}: {c.words}\n    {c.ours}" for c in claims if c is not None)
+    claims = _judge(record, results)
+    return "\n".join(f"{claim.verdict}: {claim.words}\n    {claim.ours}" for claim in claims)
 
 
 def markdown_claims(records: Sequence[Record], results: Path) -> str:

@@ -94,9 +94,8 @@ def _training_panel(record: Record, name: str) -> Panel:
         lengths.append(max(pairs, default=1))
         values = [defined(point.get(name)) for point in result.curve]
         if pairs and None not in values:
-            unit = (
-                1 / values[0] if name == "loss" and values[0] else factor
-            )  # losses differ in unit
+            # The arms' losses have no unit in common.
+            unit = 1 / values[0] if name == "loss" and values[0] else factor
             y = [unit * value for value in values if value is not None]
             series.append(CurveSeries(arm, colour, pairs, y))
         final = record.paper[arm].get(name) if arm in record.paper else None
@@ -215,6 +214,11 @@ def draw_matches(snapshot: PairSnapshot, title: str, path: Path) -> None:
         axes.set_axis_off()
     both[1].legend(fontsize="x-small", loc="best")
     save(figure, path)
+
+
+def thin(points: np.ndarray, count: int) -> np.ndarray:
+    """Take at most so many of the points (N, 3), evenly over their order."""
+    return points[np.linspace(0, len(points) - 1, min(count, len(points))).astype(int)]
 
 
 def principal_axes(points: np.ndarray) -> np.ndarray:

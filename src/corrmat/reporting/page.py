@@ -64,7 +64,7 @@ def build_page(results: Path) -> str:
         articles = [_article(record, results, figures) for record in same]
         sections.append(Section(identity, title, articles))
     return _ENVIRONMENT.get_template("records.html.j2").render(
-        claims=claims_of([r for r in records if r.scale != "smoke"], results),
+        claims=claims_of(records, results),
         summary=[row for record in records for row in _summary_rows(record)],
         sections=sections,
         robustness=_robustness(results, figures),
