@@ -19,6 +19,7 @@ from conftest import ROOT, shared
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
+from corrmat import weights
 from corrmat.baselines import is_available
 from corrmat.errors import CorrmatError
 from corrmat.metrics import rotation_error_deg
@@ -547,3 +548,15 @@ def test_a_record_says_what_its_arms_were_trained_on(tmp_path, monkeypatch):
     assert record.hardware["precision"] == "bf16-mixed / 32-true"  # PCRNet_corr: see pcrnet.yaml
     assert record.hardware["threads"] == torch.get_num_threads()
     assert record.hardware["gpu"] == torch.cuda.is_available()
+
+
+def test_training_starts_from_other_weights():
+    settings = recipe.load(ROOT / "configs" / "weights.yaml", "laptop").arms["Invariant_corr"]
+    method = fit.fresh_method(settings)
+    started, shipped = method.network.state_dict(), weights.load_model().state_dict()
+    assert all(torch.equal(started[name], shipped[name]) for name in shipped)
+    assert all(module.training for module in method.modules())
+    smaller = {"network": {"layers": 1}}
+    other = recipe.load(ROOT / "configs" / "weights.yaml", "laptop", smaller).arms["Invariant_corr"]
+    with pytest.raises(CorrmatError, match="does not fit"):
+        fit.fresh_method(other)

@@ -7,7 +7,7 @@ from twins import within_radius_loops
 
 from corrmat.networks.ppf import neighborhoods, point_pair_features
 from corrmat.ops import neighbors
-from corrmat.ops.neighbors import gather_points, knn, nearest, within_radius
+from corrmat.ops.neighbors import gather_points, knn, nearest, neighbors_at_ranks, within_radius
 
 
 @pytest.mark.parametrize("chunk", [1, 100, 2**24])
@@ -66,3 +66,9 @@ def test_pair_features_do_not_change_when_the_cloud_moves(generator):
     features = again.features()[0, 7, 2]
     torch.testing.assert_close(features[:3], moved[0, 7, :3])
     torch.testing.assert_close(features[6:], again.ppf[0, 7, 2])
+
+
+def test_neighbors_at_ranks_are_those_of_knn(generator):
+    points = torch.randn(2, 30, 3, generator=generator)
+    ranks = torch.tensor([[0, 1, 2], [0, 7, 29]])
+    assert torch.equal(neighbors_at_ranks(points, ranks), knn(points, 30)[..., ranks])

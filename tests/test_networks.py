@@ -141,6 +141,10 @@ def test_attention_and_norm_equal_their_twins(generator):
     layer = Attention(12, 3).double()
     x, memory = torch.randn(2, 2, 7, 12, generator=generator, dtype=torch.float64)
     torch.testing.assert_close(layer(x, memory), attention(x, memory, layer))
+    with torch.autocast("cpu", torch.bfloat16):
+        half = layer.float()(x.float(), memory.float())
+    exact = attention(x, memory, layer.double())
+    torch.testing.assert_close(half.double(), exact, atol=0.02, rtol=0.05)
     norm = StdNorm(12).double()
     norm.gain.data = torch.linspace(0.5, 2, 12, dtype=torch.float64)
     torch.testing.assert_close(norm(x), std_norm(x, norm.gain, norm.bias), rtol=1e-5, atol=1e-5)

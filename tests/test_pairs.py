@@ -7,6 +7,7 @@ import torch
 from corrmat.data.clouds import CloudSet
 from corrmat.data.datamodule import RegistrationDataModule
 from corrmat.data.pairs import Key, PairSettings, Purpose, generator, make_pairs
+from corrmat.data.visibility import depth_noise
 from corrmat.errors import CorrmatError
 from corrmat.ops import rigid
 
@@ -319,3 +320,68 @@ def test_stretched_shapes_are_others_of_the_same_size(clouds):
 def test_stretching_needs_estimated_normals(stretch):
     with pytest.raises(CorrmatError, match="stretch"):
         PairSettings(stretch=stretch)
+
+
+@pytest.fixture(scope="module")
+def ball():
+    """Points and normals of a sphere: a camera sees the half that faces it."""
+    normals = np.random.default_rng(0).standard_normal((1, 2048, 3)).astype(np.float32)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    return CloudSet(np.concatenate([0.8 * normals, normals], -1), np.zeros(1, np.int64), ("ball",))
+
+
+def view(ball, **options):
+    fixed = {"sampling": "disjoint", "corrupted": "both", "keep": 0.5, "views": 1.0}
+    return pairs_of(ball, **fixed | {"num_points": 80, "translation": 0.0} | options)
+
+
+def test_a_view_is_what_faces_its_camera(ball):
+    pairs = view(ball, view_deg=0.0)
+    points = torch.cat([aligned(pairs)[0], pairs.target[0, :, :3]])
+    assert pairs.source.shape == pairs.target.shape == (1, 40, 6)
+    toward = points.mean(0) / points.mean(0).norm()
+    # From a distance of at most four, the horizon of a ball of 0.8 lies at 0.16 or beyond. Points
+    # are too sparse to hide all of what is just behind it.
+    assert (points @ toward > 0.16).float().mean() > 0.85
+    assert (points @ toward).min() > -0.3
+    assert not (torch.cdist(aligned(pairs), pairs.target[..., :3]) < 1e-6).any()
+
+
+def test_views_from_opposite_sides_share_nothing(ball):
+    def shares(view_deg):
+        pairs = (view(ball, epoch=epoch, view_deg=view_deg, num_points=800) for epoch in range(20))
+        return [(each.match < 400).float().mean().item() for each in pairs]
+
+    assert min(shares(0.0)) > 0.8
+    assert min(shares(180.0)) < 0.1
+
+
+def test_a_view_that_sees_few_points_repeats_them(ball):
+    pairs = view(ball, num_points=900, keep=1.0)
+    assert pairs.source.shape == (1, 900, 6)
+    assert len(pairs.source[0].unique(dim=0)) < 500
+
+
+def test_noise_of_a_view_lies_on_the_rays_and_grows_with_distance():
+    camera, noise = np.array([0.0, 0, 3]), np.full((2, 3), 0.01)
+    moved = depth_noise(np.array([[0.0, 0, 1], [0.0, 0, -1]]), camera, noise)
+    np.testing.assert_allclose(moved, [[0, 0, -0.04 / 9], [0, 0, -0.16 / 9]])
+
+
+def test_part_of_the_pairs_are_views(clouds):
+    fixed = {"sampling": "disjoint", "corrupted": "both", "keep": 0.7}
+    whole, none = pairs_of(clouds, **fixed, views=1.0), pairs_of(clouds, **fixed)
+    some = [pairs_of(clouds, epoch=e, **fixed, views=0.5) for e in range(4)]
+    same = [
+        torch.equal(a, b)
+        for e, pairs in enumerate(some)
+        for a, b in zip(pairs.source, pairs_of(clouds, epoch=e, **fixed).source, strict=True)
+    ]
+    assert 3 < sum(same) < 17
+    assert not torch.equal(whole.source, none.source)
+
+
+@pytest.mark.parametrize("wrong", [{"views": 0.5}, {"views": -0.1}, {"view_deg": 200.0}])
+def test_views_need_two_scans(wrong):
+    with pytest.raises(CorrmatError, match="out of range"):
+        PairSettings(**wrong)

@@ -4,9 +4,10 @@ import sys
 import numpy as np
 import pytest
 
-from corrmat.data import build, clouds
+from corrmat.data import build, clouds, registry
 from corrmat.data.shapes import dataset as shapes
 from corrmat.data.shapes.families import FAMILIES
+from corrmat.errors import CorrmatError
 
 
 @pytest.mark.parametrize("name", FAMILIES)
@@ -97,3 +98,31 @@ def test_a_plain_script_makes_the_shapes_without_a_main_guard(way, tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.split()[-1] == "11"
+
+
+def test_assemblies_are_sound_differ_and_are_the_same_again():
+    made = [
+        shapes.make_assembly((split, index))[0] for split in ("train", "test") for index in (0, 1)
+    ]
+    for rows in made:
+        assert rows.shape == (2048, 6)
+        np.testing.assert_allclose(np.linalg.norm(rows[:, 3:], axis=1), 1, atol=1e-5)
+        assert np.linalg.norm(rows[:, :3], axis=1).max() == pytest.approx(1, abs=1e-5)
+    assert len({rows.tobytes() for rows in made}) == 4
+    np.testing.assert_array_equal(made[1], shapes.make_assembly(("train", 1))[0])
+
+
+@pytest.mark.parametrize("small", [0, 200])
+def test_data_sets_are_joined(small, monkeypatch):
+    monkeypatch.setattr(shapes, "SMALL", small)
+    monkeypatch.setattr(shapes, "SIZE", {"train": 8, "test": 4})
+    monkeypatch.setattr(shapes, "ASSEMBLIES", {"train": 6, "test": 2})
+    both = registry.load_clouds("shapes+assemblies", "test", 4)
+    assert [both.names[label] for label in both.labels] == [
+        "airplane", "bathtub", "assembly", "assembly",
+    ]  # fmt: skip
+    np.testing.assert_array_equal(both.rows[3], registry.load_clouds("assemblies", "test").rows[1])
+    np.testing.assert_array_equal(both.select(slice(1, 2)).rows[0], shapes.load("test").rows[1])
+    assert len(registry.load_clouds("shapes+assemblies", "train")) == 14
+    with pytest.raises(CorrmatError, match="unknown data set 'shops'"):
+        registry.load_clouds("shapes+shops", "train")

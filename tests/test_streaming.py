@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from corrmat.ops import streaming
-from corrmat.ops.streaming import argmax_rows, softmax_rows
+from corrmat.ops.streaming import argmax_rows, log_sums, softmax_rows
 
 
 def vectors(generator, outlier):
@@ -96,3 +96,13 @@ def test_memory_is_not_that_of_the_matrix():
         [sys.executable, "-c", MEMORY], capture_output=True, text=True, env=environment
     )
     assert 0 < float(result.stdout) < 60, result.stderr
+
+
+@pytest.mark.parametrize("dense", [0, 2**23])
+def test_log_sums_of_rows_and_columns(dense, generator, monkeypatch):
+    monkeypatch.setattr(streaming, "_DENSE", dense)
+    a, b = (torch.randn(2, n, 5, generator=generator, dtype=torch.float64) for n in (7, 9))
+    scores = a @ b.mT
+    rows, columns = log_sums(a, b)
+    torch.testing.assert_close(rows, scores.logsumexp(2))
+    torch.testing.assert_close(columns, scores.logsumexp(1))

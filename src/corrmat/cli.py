@@ -93,7 +93,7 @@ def train_weights(recipe: Path) -> None:
         from corrmat.training.recipe import load
 
         experiment = load(recipe, options.scale, options.overrides)
-        if (experiment.scale, experiment.data) == ("laptop", "shapes"):
+        if (experiment.scale, experiment.data) == ("laptop", "shapes+assemblies"):
             ship(options.runs / experiment.place / experiment.treatment / "last.ckpt")
     sys.exit(code)
 

@@ -110,7 +110,7 @@ def parse(words: Sequence[str]) -> Namespace:
         from corrmat.training.recipe import GROUPS
 
         settings = given[parsed.command].as_dict()
-        options.overrides = {k: v for k, v in settings.items() if k in ("seed", *GROUPS)}
+        options.overrides = {k: v for k, v in settings.items() if k in ("seed", "start", *GROUPS)}
     return options
 
 

@@ -92,7 +92,7 @@ def load_reference(kind: str, state_dict: Mapping[str, Any], **hparams: Any) -> 
         for name, value in state_dict.items()
         if name not in _IGNORED
     }
-    return _load_state(_BUILD[kind](ours, hparams), ours)
+    return load_state(_BUILD[kind](ours, hparams), ours)
 
 
 SHIPPED = Path(__file__).parent / "shipped" / "corrmat.safetensors"
@@ -118,13 +118,13 @@ def load_model(model: str | Path = "corrmat") -> nn.Module:
     """
     if str(model) == "corrmat":
         network = InvariantNetwork(**json.loads(shipped_metadata()["network"]))
-        return _load_state(network, safetensors.torch.load_file(SHIPPED))
+        return load_state(network, safetensors.torch.load_file(SHIPPED))
     if str(model) in shipped_models():
         from corrmat.methods import METHODS  # imports Lightning, which `register` does not need
 
         about = shipped_metadata(str(model))
         network = METHODS[about["method"]].network_type(**json.loads(about["network"]))
-        return _load_state(network, safetensors.torch.load_file(_shipped_file(str(model))))
+        return load_state(network, safetensors.torch.load_file(_shipped_file(str(model))))
     path = Path(model)
     content = _read_checkpoint(path)
     if "method" in content:
@@ -251,7 +251,7 @@ def checkpoint_network(path: Path) -> tuple[str, dict[str, Any], nn.Module]:
         for name, value in _tensors(path, content).items()
         if name.startswith("network.")
     }
-    return method, hparams, _load_state(network, state)
+    return method, hparams, load_state(network, state)
 
 
 def _kind_of(path: Path, state: State) -> str:
@@ -329,7 +329,7 @@ def _required(state: State, name: str, what: str, theirs: str) -> Tensor:
     return state[name]
 
 
-def _load_state(network: nn.Module, state: State) -> nn.Module:
+def load_state(network: nn.Module, state: State) -> nn.Module:
     """Load a state into a network, or name every parameter that does not fit."""
     expected = network.state_dict()
     wrong = [f"{name} is missing" for name in expected if name not in state]

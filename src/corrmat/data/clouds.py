@@ -54,6 +54,13 @@ class ShardedRows:
         subset._index = self._index[key]
         return subset
 
+    @classmethod
+    def joined(cls, parts: Sequence["ShardedRows"]) -> "ShardedRows":
+        """Join sets one after the other, without reading them."""
+        firsts = np.cumsum([0, *(part._starts[-1] for part in parts)])
+        index = [part._index + first for part, first in zip(parts, firsts, strict=False)]
+        return cls([file for part in parts for file in part._files], np.concatenate(index))
+
     def _read(self, position: int) -> np.ndarray:
         """Read the row at a position of the whole set, (P, 6)."""
         shard = int(np.searchsorted(self._starts, position, "right")) - 1
@@ -84,6 +91,28 @@ class CloudSet:
         rows = self.rows
         rows = rows.select(key) if isinstance(rows, ShardedRows) else rows[key]
         return CloudSet(rows, self.labels[key], self.names)
+
+    @classmethod
+    def joined(cls, sets: Sequence["CloudSet"]) -> "CloudSet":
+        """Join sets one after the other.
+
+        Raises:
+            CorrmatError: their clouds differ in the number of points.
+        """
+        sizes = {clouds.num_points for clouds in sets}
+        if len(sizes) > 1:
+            raise CorrmatError(f"data sets with clouds of {sorted(sizes)} points cannot be joined")
+        rows = [clouds.rows for clouds in sets]
+        sharded = [part for part in rows if isinstance(part, ShardedRows)]
+        firsts = np.cumsum([0, *(len(clouds.names) for clouds in sets)])
+        labels = [clouds.labels + first for clouds, first in zip(sets, firsts, strict=False)]
+        return cls(
+            ShardedRows.joined(sharded)
+            if len(sharded) == len(rows)
+            else np.concatenate([part[:] for part in rows]),
+            np.concatenate(labels),
+            tuple(name for clouds in sets for name in clouds.names),
+        )
 
     def only(self, categories: Sequence[str]) -> "CloudSet":
         """Return the shapes of these categories.

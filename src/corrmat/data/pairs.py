@@ -18,6 +18,7 @@ from torch import Tensor
 
 from corrmat.data.clouds import CloudSet
 from corrmat.data.normals import estimate_normals
+from corrmat.data.visibility import depth_noise, visible_points
 from corrmat.errors import CorrmatError
 from corrmat.ops import rigid
 from corrmat.types import MATCH_DISTANCE, PairBatch
@@ -47,6 +48,10 @@ class PairSettings:
             where inliers lie at 0, and else `types.MATCH_DISTANCE`.
         corrupted: which clouds are cropped and get outliers. With "both", a source point whose
             surface the target lacks is labelled an outlier too.
+        views: share of the pairs whose clouds are what a depth camera sees, each from its own
+            viewpoint, instead of crops with a plane: without what is hidden, and with noise along
+            the camera's rays. Needs disjoint sampling, and both clouds corrupted.
+        view_deg: largest angle between the two viewpoints of such a pair.
         normals: "given" with the clean cloud, or "estimated" from each corrupted one.
         stretch: augmentation of training shapes: every axis is scaled by a factor between
             1 / stretch and stretch, and half of the shapes are mirrored. 1 switches it off;
@@ -63,6 +68,8 @@ class PairSettings:
     outliers: float = 0.0
     outlier_distance: float | None = None
     corrupted: Literal["source", "both"] = "source"
+    views: float = 0.0
+    view_deg: float = 60.0
     normals: Literal["given", "estimated"] = "given"
     stretch: float = 1.0
 
@@ -76,6 +83,9 @@ class PairSettings:
             "jitter": self.jitter >= 0,
             "outliers": 0 <= self.outliers < 1,
             "outlier_distance": self.outlier_distance is None or self.outlier_distance > 0,
+            "views": self.views == 0
+            or (0 < self.views <= 1 and (self.sampling, self.corrupted) == ("disjoint", "both")),
+            "view_deg": 0 <= self.view_deg <= 180,
             "stretch": self.stretch == 1 or (self.stretch > 1 and self.normals == "estimated"),
         }
         for name, valid in checks.items():
@@ -125,6 +135,7 @@ class Purpose(IntEnum):
     TARGET_CROP = 3
     TARGET_OUTLIERS = 4
     STRETCH = 5
+    VIEWS = 6
 
 
 _NOTHING = np.empty(0, np.float32)
@@ -144,6 +155,8 @@ class _Draw(NamedTuple):
     target_outlier: np.ndarray  # as outlier and outlier_rows, if both clouds are corrupted
     target_outlier_rows: np.ndarray
     stretch: np.ndarray  # (4,) in [0, 1): factors of the axes, mirror
+    cameras: np.ndarray  # (2, 3) of source and target, in the source's frame; empty without views
+    order: np.ndarray  # (P,) permutation, whose halves are what either camera may see; or empty
 
 
 def make_pairs(
@@ -176,6 +189,12 @@ def make_pairs(
         if both:
             kept = _crop(target[..., :3], _stack(draws, "target_plane"), settings.num_source)
             target = np.take_along_axis(target, kept[..., None], 1)
+    views = [(b, draw) for b, draw in enumerate(draws) if len(draw.cameras)]
+    for b, draw in views:
+        for cloud, camera, half in zip(
+            (source[b], target[b]), draw.cameras, np.array_split(draw.order, 2), strict=True
+        ):
+            cloud[:] = _seen(clean[b], half, camera, len(cloud))
     if settings.outliers:
         batch = np.arange(len(draws))[:, None]
         source[batch, _stack(draws, "outlier")] = _stack(draws, "outlier_rows")
@@ -187,8 +206,12 @@ def make_pairs(
         match = _nearest(source[..., :3], target[..., :3], settings.max_match_distance)
     if settings.jitter:
         noise = settings.jitter * _stack(draws, "noise")
-        source[..., :3] += noise[:, : settings.num_source]
-        target[..., :3] += noise[:, settings.num_source :][:, : target.shape[1]]
+        noises = noise[:, : settings.num_source], noise[:, settings.num_source :]
+        for cloud, offset, which in zip((source, target), noises, (0, 1), strict=True):
+            offset = offset[:, : cloud.shape[1]]
+            for b, draw in views:
+                offset[b] = depth_noise(cloud[b, :, :3], draw.cameras[which], offset[b])
+            cloud[..., :3] += offset
     if settings.normals == "estimated":
         for cloud in (*source, *target):
             cloud[:, 3:] = estimate_normals(cloud[:, :3])
@@ -243,9 +266,27 @@ def _draw(settings: PairSettings, size: int, key: Key) -> _Draw:
         target_plane = generator(key, Purpose.TARGET_CROP).standard_normal(3)
     if settings.stretch > 1:
         stretch = generator(key, Purpose.STRETCH).random(4)
+    cameras = order = _NOTHING
+    if settings.views:
+        rng = generator(key, Purpose.VIEWS)
+        if rng.random() < settings.views:
+            cameras, order = _draw_cameras(rng, settings.view_deg), rng.permutation(size)
     return _Draw(
-        source, target, normal, uniform, noise, *outliers, target_plane, *target_outliers, stretch
-    )
+        source, target, normal, uniform, noise, *outliers, target_plane, *target_outliers, stretch,
+        cameras, order,
+    )  # fmt: skip
+
+
+def _draw_cameras(rng: np.random.Generator, view_deg: float) -> np.ndarray:
+    """Draw two cameras (2, 3), two and a half to four radii from the centre."""
+    toward, side = rng.standard_normal((2, 3))
+    toward /= np.linalg.norm(toward)
+    side -= (side @ toward) * toward
+    side /= np.linalg.norm(side)
+    angle, *distances = rng.random(3)
+    angle = np.deg2rad(view_deg) * angle
+    directions = np.stack([toward, np.cos(angle) * toward + np.sin(angle) * side])
+    return directions * (2.5 + 1.5 * np.array(distances))[:, None]
 
 
 def _draw_outliers(
@@ -279,6 +320,16 @@ def _stretch(rows: np.ndarray, uniform: np.ndarray, most: float) -> np.ndarray:
     points = rows[..., :3] * factor[:, None]
     points /= np.linalg.norm(points, axis=-1).max(1)[:, None, None]
     return np.concatenate([points, np.zeros_like(points)], -1).astype(np.float32)
+
+
+def _seen(clean: np.ndarray, half: np.ndarray, camera: np.ndarray, count: int) -> np.ndarray:
+    """Return `count` rows of a clean cloud (P, 6) that a camera sees, repeated if it sees fewer.
+
+    All points hide each other; those of one half are returned, so that two views share none.
+    """
+    visible = np.zeros(len(clean), bool)
+    visible[visible_points(clean[:, :3], camera)] = True
+    return clean[np.resize(half[visible[half]], count)]
 
 
 def _crop(points: np.ndarray, plane: np.ndarray, keep: int) -> np.ndarray:

@@ -13,6 +13,7 @@ Loader = Callable[[str, int | None, Path | None], CloudSet]
 
 DATASETS: dict[str, Loader] = {
     "shapes": dataset.load,
+    "assemblies": dataset.load_assemblies,
     "modelnet40": modelnet40.load,
     "folder": folder.load,
 }
@@ -21,11 +22,18 @@ DATASETS: dict[str, Loader] = {
 def load_clouds(
     name: str, split: str, count: int | None = None, root: Path | None = None
 ) -> CloudSet:
-    """Load a split of a data set.
+    """Load a split of a data set, or of several joined by "+", e.g. "shapes+assemblies".
 
     Raises:
-        CorrmatError: there is no such data set, or it cannot be read.
+        CorrmatError: there is no such data set, or it cannot be read; their clouds differ in
+            the number of points.
     """
-    if name not in DATASETS:
-        raise CorrmatError(f"unknown data set {name!r}; data sets: {', '.join(DATASETS)}")
-    return DATASETS[name](split, count, root)
+    names = name.split("+")
+    for each in names:
+        if each not in DATASETS:
+            raise CorrmatError(f"unknown data set {each!r}; data sets: {', '.join(DATASETS)}")
+    if len(names) == 1:
+        return DATASETS[name](split, count, root)
+    share = None if count is None else -(-count // len(names))
+    joined = CloudSet.joined([DATASETS[each](split, share, root) for each in names])
+    return joined.select(slice(count))

@@ -14,7 +14,7 @@ from corrmat.errors import require_positive
 from corrmat.networks.attention import Attention, FeedForward
 from corrmat.networks.matching import Matchability
 from corrmat.networks.ppf import SIGNLESS, signless_pair_features
-from corrmat.ops.neighbors import gather_points
+from corrmat.ops.neighbors import gather_points, neighbors_at_ranks
 from corrmat.ops.rigid import procrustes
 from corrmat.types import Prediction, last_of
 
@@ -81,9 +81,8 @@ class InvariantNetwork(nn.Module):
         points = cloud[..., :3]
         n = points.shape[1]
         sizes = [min(n, max(2, round(share * n))) for share in self.shares]
-        nearest = torch.cdist(points, points).topk(max(sizes), largest=False).indices
         ranks = torch.stack([evenly_spaced_indices(size, self.neighbors) for size in sizes])
-        return pair_features(cloud, nearest[..., ranks.to(nearest.device)], scale)
+        return pair_features(cloud, neighbors_at_ranks(points, ranks), scale)
 
 
 def radius(points: Tensor) -> Tensor:

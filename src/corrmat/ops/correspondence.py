@@ -8,7 +8,7 @@ from torch import Tensor
 
 from corrmat.ops.neighbors import gather_points
 from corrmat.ops.sinkhorn import Slack, sinkhorn_potentials
-from corrmat.ops.streaming import argmax_rows, softmax_rows
+from corrmat.ops.streaming import argmax_rows, log_sums, softmax_rows
 
 
 class SoftCorrespondence:
@@ -219,8 +219,7 @@ class MatchabilityCorrespondence(_LogCorrespondence):
         a, b, out = super()._vectors
         assert out is not None
         with torch.autocast(a.device.type, enabled=False):
-            rows, _ = softmax_rows(a, b, b[..., :0])
-            columns, _ = softmax_rows(b, a, a[..., :0])
+            rows, columns = log_sums(a, b)
         u, v = rows - F.logsigmoid(-out), columns - F.logsigmoid(self.matchable_target)
         return *_subtract_potentials(2 * a, b, u, v), F.logsigmoid(out)
 

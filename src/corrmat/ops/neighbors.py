@@ -1,5 +1,6 @@
 """Neighbour queries: k nearest, within a radius, and the nearest point of another cloud."""
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -30,6 +31,25 @@ def knn(points: Tensor, k: int) -> Tensor:
     rows = max(1, _CHUNK // max(1, points.shape[0] * points.shape[1]))
     parts = [torch.cdist(x, points).topk(k, largest=False).indices for x in points.split(rows, 1)]
     return torch.cat(parts, 1)
+
+
+@torch.no_grad()
+def neighbors_at_ranks(points: Tensor, ranks: Tensor) -> Tensor:
+    """Find each point's r-th nearest point of its cloud, for every rank r; rank 0 is itself.
+
+    Args:
+        points: (B, N, 3).
+        ranks: int64 of any shape, below N.
+
+    Returns:
+        (B, N, *ranks.shape) int64.
+    """
+    distance = torch.cdist(points, points)
+    if distance.device.type == "cpu":  # numpy sorts with vector instructions, torch does not
+        order = torch.from_numpy(np.argsort(distance.numpy(), -1))
+    else:
+        order = distance.argsort(-1)
+    return order[..., ranks.to(order.device)]
 
 
 @torch.no_grad()

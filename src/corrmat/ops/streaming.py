@@ -47,6 +47,17 @@ def softmax_rows(
     return total, scores.softmax(2)[..., : f_y.shape[1]] @ values
 
 
+def log_sums(f_x: Tensor, f_y: Tensor) -> tuple[Tensor, Tensor]:
+    """Compute the log-sum-exp of the rows (B, N) and of the columns (B, M) of S = F_X F_Y^T."""
+    if not fits_in_memory(f_x, f_y):
+        return (
+            softmax_rows(f_x, f_y, f_y[..., :0])[0],
+            softmax_rows(f_y, f_x, f_x[..., :0])[0],
+        )
+    scores = f_x @ f_y.mT
+    return scores.logsumexp(2), scores.logsumexp(1)
+
+
 @torch.no_grad()
 def argmax_rows(f_x: Tensor, f_y: Tensor, last: Tensor | None = None) -> Tensor:
     """Find the column (B, N) of the largest entry of each row of F_X F_Y^T; M if `last` is."""

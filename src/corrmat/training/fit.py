@@ -33,6 +33,7 @@ from corrmat.training.hardware import (
 from corrmat.training.preflight import Arm, build_method
 from corrmat.training.recipe import ArmSettings
 from corrmat.training.runs import TrainedArm
+from corrmat.weights import load_model, load_state
 
 log = logging.getLogger("corrmat")
 _TIMED_STEPS = 3
@@ -119,9 +120,16 @@ def train(
 
 
 def fresh_method(settings: ArmSettings) -> Method:
-    """Build the method with the weights that its seed gives: where training starts."""
+    """Build the method where training starts: with the weights that its seed gives, or others.
+
+    Raises:
+        CorrmatError: the weights to start from are of another network.
+    """
     L.seed_everything(settings.seed, workers=True, verbose=False)
-    return build_method(settings)
+    method = build_method(settings)
+    if settings.start is not None:
+        load_state(method.network, load_model(settings.start).state_dict()).train()
+    return method
 
 
 def seconds_to_train(arm: Arm) -> float | None:

@@ -32,7 +32,7 @@ Settings = dict[str, object]
 _KEYS = {
     "id", "title", "family", "baseline", "treatment", "controls", "paper", "arms", "scales",
     "bands_deg", "sweep_outliers", "networks_of", "baselines", "test_pairs", "base", "seed",
-    *GROUPS,
+    "start", *GROUPS,
 }  # fmt: skip
 _NOT_TRAINER: set[str | int] = {  # set by this project
     "enable_checkpointing", "enable_model_summary", "logger", "callbacks", "default_root_dir",
@@ -54,6 +54,7 @@ class ArmSettings:
     loss: Namespace  # of the method's LossSettings
     optimizer: OptimizerSettings
     trainer: Namespace  # of Lightning's Trainer; `precision` may be "auto"
+    start: str | None = None  # weights to start from, as `load_model` takes them
 
     @property
     def data_name(self) -> str:
@@ -64,7 +65,8 @@ class ArmSettings:
         """Return the settings as dictionaries, lists, numbers and text, as YAML has them."""
         groups = {name: getattr(self, name) for name in GROUPS}
         groups["optimizer"] = asdict(self.optimizer)
-        return cast(Settings, _plain({"method": self.method, "seed": self.seed, **groups}))
+        start = {"start": self.start} if self.start else {}
+        return cast(Settings, _plain({"method": self.method, "seed": self.seed, **start, **groups}))
 
 
 @dataclass(frozen=True)
@@ -124,7 +126,7 @@ def load(
     for arm in arms or ():
         if arm not in all_arms:
             raise CorrmatError(f"{path}: unknown arm {arm!r}; arms: {', '.join(all_arms)}")
-    common = {key: merged[key] for key in ("seed", *GROUPS) if key in merged}
+    common = {key: merged[key] for key in ("seed", "start", *GROUPS) if key in merged}
     settings = {
         arm: _arm_settings(arm, common, dict(all_arms[arm] or {}), overrides or {}, path)
         for arm in arms or all_arms
@@ -156,6 +158,10 @@ def add_settings(parser: ArgumentParser, methods: Sequence[str] = tuple(METHODS)
     """
     classes = [METHODS[name] for name in methods]
     parser.add_argument("--seed", type=int, default=0, help="of weights, pairs and held-out shapes")
+    parser.add_argument(
+        "--start", type=str | None, default=None,
+        help="weights to start from, as --model of corrmat register takes them",
+    )  # fmt: skip
     parser.add_class_arguments(RegistrationDataModule, "data", skip={"seed"})
     _add_union(parser, "network", [method.network_type for method in classes])
     _add_union(parser, "loss", [method.LossSettings for method in classes])
@@ -301,7 +307,7 @@ def _arm_settings(
     return ArmSettings(
         arm, method, parsed.seed, parsed.data, parsed.network,
         parsed.get("loss") or Namespace(), OptimizerSettings(**parsed.optimizer.as_dict()),
-        parsed.trainer,
+        parsed.trainer, parsed.start,
     )  # fmt: skip
 
 

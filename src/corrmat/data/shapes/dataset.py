@@ -1,9 +1,10 @@
-"""The embedded data set: parametric CAD-like shapes, made on first use and cached.
+"""The embedded data sets: CAD-like shapes of forty families, and random assemblies of solids.
 
-Shape i of a split is a pure function of (split, i). Families take turns, so that the first n
-shapes are a balanced data set of their own.
+Both are made on first use and cached. Shape i of a split is a pure function of (split, i).
+Families take turns, so that the first n shapes are a balanced data set of their own.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,17 +13,24 @@ import trimesh
 from corrmat.data.build import build_shards
 from corrmat.data.clouds import CloudSet, cache_folder, open_shards
 from corrmat.data.shapes import families
+from corrmat.data.shapes.assemblies import assembly
+from corrmat.data.shapes.solids import merged
 from corrmat.errors import CorrmatError
 
 VERSION = 1  # raise it when a shape changes; the digests of test pairs in the recipes tell
 SIZE = {"train": 4000, "test": 800}
+ASSEMBLIES = {"train": 8000, "test": 200}
 POINTS = 2048
 NAMES = tuple(families.FAMILIES)
 SMALL = 200  # up to this many shapes are made on the spot instead of building the cache
+_ASSEMBLY_SEED = 1  # families have none
+
+MakeShape = Callable[[tuple[str, int]], tuple[np.ndarray, int]]
+"""(split, index) -> (2048, 6) float32 points and unit face normals, and the label."""
 
 
 def load(split: str, count: int | None = None, root: Path | None = None) -> CloudSet:
-    """Load the first `count` shapes of a split, all by default.
+    """Load the first `count` shapes of a split of the forty families, all by default.
 
     The whole split is made once, in about a minute on two cores, and kept in the cache folder.
 
@@ -34,42 +42,68 @@ def load(split: str, count: int | None = None, root: Path | None = None) -> Clou
     Raises:
         CorrmatError: more shapes are asked for than there are.
     """
-    size = SIZE[split]
+    return _load("shapes", split, count, SIZE[split], NAMES, make_shape)
+
+
+def load_assemblies(split: str, count: int | None = None, root: Path | None = None) -> CloudSet:
+    """Load random assemblies; see `load`. Making them takes two minutes on two cores."""
+    return _load("assemblies", split, count, ASSEMBLIES[split], ("assembly",), make_assembly)
+
+
+def _load(
+    name: str, split: str, count: int | None, size: int, names: tuple[str, ...], make: MakeShape
+) -> CloudSet:
+    """Load the first `count` of a split's shapes from the cache, which is made if it is not there.
+
+    Args:
+        name: of the data set.
+        split: "train" or "test".
+        count: number of shapes; None for all.
+        size: number of shapes of the split.
+        names: of the categories.
+        make: makes one shape.
+    """
     count = size if count is None else count
     if not 0 < count <= size:
-        raise CorrmatError(f"the {split} split has {size} shapes, {count} were asked for")
-    folder = cache_folder() / f"shapes-v{VERSION}-{split}"
+        raise CorrmatError(f"the {split} split has {size} {name}, {count} were asked for")
+    folder = cache_folder() / f"{name}-v{VERSION}-{split}"
     clouds = open_shards(folder)
     if clouds is None and count <= SMALL:
-        shapes = [make_shape((split, index)) for index in range(count)]
-        rows, labels = zip(*shapes, strict=True)
-        return CloudSet(np.stack(rows), np.array(labels, np.int64), NAMES)
+        rows, labels = zip(*map(make, [(split, index) for index in range(count)]), strict=True)
+        return CloudSet(np.stack(rows), np.array(labels, np.int64), names)
     if clouds is None:
         tasks = [(split, index) for index in range(size)]
-        build_shards(folder, NAMES, tasks, make_shape, f"making {size} {split} shapes (once)")
+        build_shards(folder, names, tasks, make, f"making {size} {split} {name} (once)")
         clouds = open_shards(folder)
     assert clouds is not None
     return clouds.select(slice(count))
 
 
 def make_shape(task: tuple[str, int]) -> tuple[np.ndarray, int]:
-    """Make one shape.
+    """Make one shape of a family."""
+    split, index = task
+    label = index % len(NAMES)
+    key = np.array([tuple(SIZE).index(split), index], np.uint64)
+    return _sample(families.FAMILIES[NAMES[label]], key), label
+
+
+def make_assembly(task: tuple[str, int]) -> tuple[np.ndarray, int]:
+    """Make one random assembly."""
+    split, index = task
+    key = np.array([_ASSEMBLY_SEED << 32 | tuple(SIZE).index(split), index], np.uint64)
+    return _sample(assembly, key), 0
+
+
+def _sample(
+    make: Callable[[np.random.Generator], list[trimesh.Trimesh]], key: np.ndarray
+) -> np.ndarray:
+    """Sample a shape of random parts, (2048, 6).
 
     Points are uniform on the surface, centred at their mean, scaled into the unit sphere.
-
-    Args:
-        task: split and index.
-
-    Returns:
-        (2048, 6) float32 points and unit face normals, and the label.
     """
-    split, index = task
-    key = np.array([tuple(SIZE).index(split), index], np.uint64)
     rng = np.random.Generator(np.random.Philox(key=key))
-    label = index % len(NAMES)
-    mesh = trimesh.util.concatenate(families.FAMILIES[NAMES[label]](rng))
-    assert isinstance(mesh, trimesh.Trimesh)
+    mesh = merged(make(rng))
     points, faces = trimesh.sample.sample_surface(mesh, POINTS, seed=rng)[:2]
     points = points - points.mean(0)
     points = points / np.linalg.norm(points, axis=1).max()
-    return np.hstack([points, mesh.face_normals[faces]]).astype(np.float32), label
+    return np.hstack([points, mesh.face_normals[faces]]).astype(np.float32)

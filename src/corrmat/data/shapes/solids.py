@@ -73,3 +73,10 @@ def legs(
 def _rotation(axis: str, degrees: float) -> np.ndarray:
     direction = np.eye(3)["xyz".index(axis)]
     return np.asarray(trimesh.transformations.rotation_matrix(np.deg2rad(degrees), direction))
+
+
+def merged(parts: Sequence[Trimesh]) -> Trimesh:
+    """All parts as one mesh."""
+    mesh = trimesh.util.concatenate(parts)
+    assert isinstance(mesh, Trimesh)
+    return mesh
