@@ -265,7 +265,7 @@ def test_ctrl_c_in_the_last_step_stops_the_run_with_its_arm_trained(tmp_path, ca
 
 def test_a_network_that_the_paper_knows_nothing_of_leaves_a_record(tmp_path):
     """Without a matrix to be looked at, and without a figure of the paper's to follow."""
-    options = ["--trainer.enable_progress_bar", "false"]
+    options = ["--trainer.enable_progress_bar", "false", "--data.data", "shapes"]
     overrides = recipe.parse_overrides(options)
     loaded = recipe.load(ROOT / "configs" / "weights.yaml", "smoke", overrides)
     experiment.run(loaded, tmp_path / "results", tmp_path / "runs")

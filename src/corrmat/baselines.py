@@ -150,6 +150,34 @@ def fpfh_fgr(
     return np.array(result.transformation)
 
 
+class KissSettings(NamedTuple):
+    """Lengths of KISS-Matcher, which derives all of its radii and bounds from one."""
+
+    voxel_size: float
+
+
+KISS = KissSettings(voxel_size=0.13)
+
+
+def kiss_matcher(
+    source: np.ndarray, target: np.ndarray, seed: int, settings: KissSettings = KISS
+) -> np.ndarray:
+    """Run KISS-Matcher (Lim et al., ICRA 2025) on all points, without its voxel sampling.
+
+    See `fpfh_ransac`. It estimates its own normals and draws nothing at random.
+    """
+    try:
+        package: Any = importlib.import_module("kiss_matcher")
+    except ImportError as error:
+        raise CorrmatError(f"kiss is KISS-Matcher: pip install kiss-matcher ({error})") from error
+    config = package.KISSMatcherConfig(voxel_size=settings.voxel_size, use_voxel_sampling=False)
+    clouds = (list(points[:, :3].astype(np.float32)) for points in (source, target))
+    solution = package.KISSMatcher(config).estimate(*clouds)
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = solution.rotation, np.ravel(solution.translation)
+    return transform
+
+
 def _open3d() -> Any:  # noqa: ANN401
     """Import Open3D, which not everybody has."""
     try:

@@ -192,10 +192,15 @@ def _compare(options: Namespace) -> int:
 
 
 def _register(options: Namespace) -> int:
-    """Register two files."""
+    """Register one file, or several, onto another."""
     for path in (options.output, options.json, options.html, options.gif):
         if path is not None and not path.parent.is_dir():
             raise CorrmatError(f"no folder {path.parent} to write {path.name} into")
+    return (_register_pair if len(options.source) == 1 else _register_several)(options)
+
+
+def _register_pair(options: Namespace) -> int:
+    """Register one file onto another."""
     if options.output is not None and options.output.suffix.lower() != ".ply":
         raise CorrmatError(
             f"the moved source is written as PLY, {options.output} has another suffix"
@@ -203,7 +208,7 @@ def _register(options: Namespace) -> int:
     from corrmat.data.scans import read_scan, write_ply
     from corrmat.files import replace_bytes, replace_text
 
-    source, target = (read_scan(path, options.seed) for path in (options.source, options.target))
+    source, target = (read_scan(path, options.seed) for path in (*options.source, options.target))
     from corrmat.registration.register import register, to_json, to_text
 
     registration = register(
@@ -227,6 +232,38 @@ def _register(options: Namespace) -> int:
 
         replace_bytes(options.gif, registration_gif(registration, source, target))
         print(f"animation: {options.gif}")
+    return 0
+
+
+def _register_several(options: Namespace) -> int:
+    """Register several files onto one."""
+    if options.html or options.gif:
+        raise CorrmatError("--html and --gif show two scans; --output moves several, to look at")
+    if options.output is not None and not options.output.is_dir():
+        raise CorrmatError(
+            f"{options.output}: with several scans, --output is a folder that exists"
+        )
+    names = [path.with_suffix(".ply").name for path in options.source]
+    if options.output is not None and len(set(names)) < len(names):
+        raise CorrmatError(f"two scans would both be written to {options.output}: rename one")
+    from corrmat.data.scans import read_scan, write_ply
+    from corrmat.files import replace_text
+
+    scans = [read_scan(path, options.seed) for path in (*options.source, options.target)]
+    from corrmat.registration import pose_graph
+
+    poses = pose_graph.register_scans(
+        scans, model=options.model, refine=options.refine, seed=options.seed
+    )
+    print(pose_graph.to_text(options.source, options.target, poses))
+    if options.output is not None:
+        for name, scan, pose in zip(names, scans, poses, strict=False):
+            moved = scan @ pose.transform[:3, :3].T + pose.transform[:3, 3]
+            write_ply(options.output / name, moved)
+        print(f"moved scans: {options.output}")
+    if options.json is not None:
+        replace_text(options.json, pose_graph.to_json(options.source, options.target, poses))
+        print(f"result: {options.json}")
     return 0
 
 

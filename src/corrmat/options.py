@@ -74,6 +74,8 @@ REGISTER_EPILOG = """examples:
       print the 4 x 4 matrix that takes scan1 onto scan2, and how far to trust it
   corrmat register part.stl scan.pcd -o aligned.ply --json T.json --html view.html
       write the moved source, the result for programs, and a page to look at
+  corrmat register front.ply left.ply back.ply -o moved/
+      every scan onto the last: all pairs are registered, and the poses that most agree on win
   corrmat register a.npy b.npy --model ransac
       the classical pipeline instead (pip install open3d)
 
@@ -156,7 +158,12 @@ def build_parser(with_settings: Sequence[str] = ()) -> ArgumentParser:
         add("compare", "compare models on the same frozen pairs", COMPARE_EPILOG, "MODELS")
     )
     _add_register_options(
-        add("register", "align two clouds of your own", REGISTER_EPILOG, "SOURCE TARGET")
+        add(
+            "register",
+            "align two clouds of your own",
+            REGISTER_EPILOG,
+            "SOURCE [SOURCE ...] TARGET",
+        )
     )
     example = add("example", "write two scans to try register on", words="FOLDER")
     example.add_argument("folder", type=Path, help="for source.ply, target.ply and truth.json")
@@ -230,7 +237,10 @@ def _add_compare_options(parser: ArgumentParser) -> None:
     """Add the options of compare."""
     parser.add_argument("models", help="e.g. corrmat,ransac,fgr,icp or checkpoint files")
     parser.add_argument(
-        "--protocol", type=Literal["paper", "real", "clean"], default="real", help="see below"
+        "--protocol",
+        type=Literal["paper", "real", "views", "clean"],
+        default="real",
+        help="see below",
     )
     parser.add_argument("--data", default="shapes", help="shapes, modelnet40 or folder")
     parser.add_argument("--root", type=Path, help="folder of the data set")
@@ -245,18 +255,21 @@ def _add_compare_options(parser: ArgumentParser) -> None:
 
 def _add_register_options(parser: ArgumentParser) -> None:
     """Add the options of register."""
-    parser.add_argument("source", type=Path, help="the cloud or mesh that is moved")
-    parser.add_argument("target", type=Path, help="the cloud or mesh that it is moved onto")
+    parser.add_argument(
+        "source", type=Path, nargs="+", help="the cloud or mesh that is moved, or several"
+    )
+    parser.add_argument("target", type=Path, help="the cloud or mesh that they are moved onto")
     parser.add_argument(
         "-o", "--output", type=Path, metavar="PLY",
-        help="write the moved source (the points sampled on it, if it is a mesh)",
+        help="write the moved source (the points sampled on it, if it is a mesh); a folder, if "
+        "there are several",
     )  # fmt: skip
     parser.add_argument("--json", type=Path, help="write matrix, confidence and verdict")
     parser.add_argument("--html", type=Path, help="write a page: before, matches, after")
     parser.add_argument("--gif", type=Path, help="write an animation of the same")
     parser.add_argument(
         "--model", default="corrmat",
-        help="corrmat (the shipped weights), icp, ransac, fgr, or a checkpoint file",
+        help="corrmat (the shipped weights), icp, ransac, fgr, kiss, or a checkpoint file",
     )  # fmt: skip
     parser.add_argument(
         "--refine", type=Literal["icp", "none"], default="icp", help="refinement after the model"

@@ -202,7 +202,7 @@ def _read_checkpoint(path: Path) -> Mapping[str, Any]:
     if not path.is_file():
         raise CorrmatError(
             f"no model {str(path)!r}: neither corrmat, {', '.join(shipped_models())}, icp, ransac, "
-            "fgr nor a checkpoint file"
+            "fgr, kiss nor a checkpoint file"
         )
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)

@@ -21,7 +21,7 @@ from corrmat.registration.register import Refine, register
 from corrmat.reporting.provenance import commit
 from corrmat.types import PairBatch
 
-Protocol = Literal["paper", "real", "clean"]
+Protocol = Literal["paper", "real", "clean", "views"]
 PROTOCOLS: dict[Protocol, PairSettings] = {
     # Experiment 1.2: the same points, the source without 30 %, the mesh's own normals.
     "paper": PairSettings(keep=0.7),
@@ -34,7 +34,17 @@ PROTOCOLS: dict[Protocol, PairSettings] = {
         corrupted="both",
         normals="estimated",
     ),
-    # The same without crop and outliers.
+    # What two depth cameras see of one object, up to 60 degrees apart.
+    "views": PairSettings(
+        keep=0.7,
+        sampling="disjoint",
+        jitter=0.01,
+        outliers=0.05,
+        corrupted="both",
+        normals="estimated",
+        views=1.0,
+    ),
+    # Two scans without crop and outliers.
     "clean": PairSettings(sampling="disjoint", jitter=0.01, normals="estimated"),
 }
 COLUMNS = {

@@ -11,7 +11,16 @@ import numpy as np
 import torch
 from torch import nn
 
-from corrmat.baselines import FPFH_FGR, FPFH_RANSAC, FpfhSettings, fpfh_fgr, fpfh_ransac
+from corrmat.baselines import (
+    FPFH_FGR,
+    FPFH_RANSAC,
+    KISS,
+    FpfhSettings,
+    KissSettings,
+    fpfh_fgr,
+    fpfh_ransac,
+    kiss_matcher,
+)
 from corrmat.errors import CorrmatError
 from corrmat.ops.ransac import ransac as ransac_on_matches
 
@@ -130,4 +139,22 @@ def fgr(
     return Hypotheses(fpfh_fgr(source, target, seed, settings)[None], *_NO_MATCHES)
 
 
-CLASSICAL: dict[str, HypothesisGenerator] = {"icp": icp, "ransac": ransac, "fgr": fgr}
+def kiss(
+    source: np.ndarray, target: np.ndarray, seed: int, settings: KissSettings = KISS
+) -> Hypotheses:
+    """Return the one hypothesis of KISS-Matcher."""
+    return Hypotheses(kiss_matcher(source, target, seed, settings)[None], *_NO_MATCHES)
+
+
+def ransac17(
+    source: np.ndarray, target: np.ndarray, seed: int, settings: FpfhSettings = FPFH_RANSAC
+) -> Hypotheses:
+    """Return as many hypotheses of RANSAC as the network has: one from each of seventeen seeds."""
+    seeds = range(17 * seed, 17 * (seed + 1))
+    found = [fpfh_ransac(source, target, each, settings) for each in seeds]
+    return Hypotheses(np.stack(found), *_NO_MATCHES)
+
+
+CLASSICAL: dict[str, HypothesisGenerator] = {
+    "icp": icp, "ransac": ransac, "ransac17": ransac17, "fgr": fgr, "kiss": kiss,
+}  # fmt: skip

@@ -94,7 +94,7 @@ def register(
         transforms = np.stack([scorer.refine(transform) for transform in transforms])
     agreements = [scorer.agreement(transform) for transform in transforms]
     supports = [hypotheses.support(transform, *subsamples) for transform in transforms]
-    best = int(np.argmax(np.multiply(agreements, supports)))
+    best = int(np.argmax(agreements))
     transform, agreement, support = transforms[best], agreements[best], supports[best]
     full = AlignmentScorer(x.points(scale, FULL_POINTS), y.points(scale, FULL_POINTS))
     if refine == "icp":

@@ -45,10 +45,20 @@ class AlignmentScorer:
         return np.asarray(result.T_target_source)
 
     def agreement(self, transform: np.ndarray) -> float:
-        """Score in [0, 1] how much of either cloud lies on the other."""
+        """Score in [0, 1] how much of either cloud lies on the other, surface along surface.
+
+        A point counts the less the farther away the nearest point of the other cloud is, and the
+        more the two normals differ, whose sign is unknown.
+        """
+        normals = [np.asarray(cloud.normals())[:, :3] for cloud in self._clouds[:2]]
+        moved = normals[0] @ transform[:3, :3].T
+        (distance, index), (back_distance, back_index) = self._nearest(transform)
         scores = [
-            np.clip(1 - (distance / self.max_distance) ** 2, 0, None).mean()
-            for distance in self._distances(transform)
+            np.clip(1 - (d / self.max_distance) ** 2, 0, None) @ np.abs((a * b).sum(1)) / len(d)
+            for d, a, b in (
+                (distance, moved, normals[1][index]),
+                (back_distance, normals[1], moved[back_index]),
+            )
         ]
         return float(np.mean(scores))
 
@@ -57,14 +67,19 @@ class AlignmentScorer:
 
         The RMS distance is NaN without any such point.
         """
-        to_target, _ = self._distances(transform)
+        (to_target, _), _ = self._nearest(transform)
         near = to_target[to_target < self.max_distance]
         rmse = float(np.sqrt(np.mean(near**2))) if len(near) else np.nan
         return len(near) / len(to_target), rmse
 
-    def _distances(self, transform: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the distances of source points to the target, and of target points back."""
+    def _nearest(self, transform: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Find the nearest target point of every source point, and the other way round.
+
+        Returns:
+            Distances and indices: (N,) each for the source, (M,) each for the target.
+        """
         rotation, translation = transform[:3, :3], transform[:3, 3]
         moved = self.source @ rotation.T + translation
         back = (self.target - translation) @ rotation
-        return self._trees[1].query(moved)[0], self._trees[0].query(back)[0]
+        found = self._trees[1].query(moved), self._trees[0].query(back)
+        return [(np.asarray(distance), np.asarray(index)) for distance, index in found]

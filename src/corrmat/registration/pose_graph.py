@@ -1,0 +1,170 @@
+"""Register several scans onto one: all pairs, then the poses on which most of them agree."""
+
+import itertools
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.progress import track
+from scipy.spatial.transform import Rotation
+
+from corrmat.errors import CorrmatError
+from corrmat.registration.register import MIN_CONFIDENCE, Refine, register
+
+_SWEEPS = 50  # of averaging; poses settle within ten
+_ANGLE_DEG, _SHARE = 10.0, 0.1  # how far a registration may be off the poses to agree with them
+
+
+@dataclass(frozen=True)
+class ScanPose:
+    """The pose of one of several scans."""
+
+    transform: np.ndarray  # (4, 4) float64, T_target_scan, in the scans' own units
+    confidence: float  # of the weakest registration on the surest way to the target
+    agree: int  # registrations of this scan that agree with the poses
+    verdict: str  # "aligned", or "doubtful: " and why
+
+
+def register_scans(
+    scans: Sequence[np.ndarray],
+    *,
+    model: str | Path = "corrmat",
+    refine: Refine = "icp",
+    seed: int = 0,
+) -> list[ScanPose]:
+    """Find the rigid transforms that take all scans onto the last.
+
+    Every pair is registered. The surest registrations that connect all scans (a maximum spanning
+    tree) give the first poses; averaging over all registrations that agree with them gives the
+    rest (chordal rotation averaging, Hartley et al., IJCV 2013).
+
+    Args:
+        scans: two or more clouds, each (N, 3) or (N, 6); the last is the target.
+        model: as for `register`.
+        refine: as for `register`.
+        seed: as for `register`.
+
+    Returns:
+        A pose for each scan but the last.
+
+    Raises:
+        CorrmatError: there are fewer than two scans; as for `register`.
+    """
+    if len(scans) < 2:
+        raise CorrmatError(f"{len(scans)} scan: two or more are needed")
+    clouds = [np.asarray(scan, np.float64)[:, :3] for scan in scans]
+    edges = []
+    pairs = list(itertools.combinations(range(len(scans)), 2))
+    for i, j in track(pairs, "registering pairs", transient=True, disable=len(pairs) == 1):
+        found = register(scans[i], scans[j], model=model, refine=refine, seed=seed)
+        edges.append(_Edge(i, j, found.transform, found.confidence))
+    graph = _PoseGraph(clouds, edges)
+    return [graph.pose(index) for index in range(len(scans) - 1)]
+
+
+def to_text(paths: Sequence[Path], target: Path, poses: Sequence[ScanPose]) -> str:
+    """Format poses for people."""
+    lines = [f"every scan onto {target} (target = matrix @ scan):"]
+    for path, pose in zip(paths, poses, strict=True):
+        lines.append(f"{path}: {pose.verdict}, confidence {pose.confidence:.0%}")
+        lines += ["  ".join(f"{v: .12g}".rjust(20) for v in row) for row in pose.transform]
+    return "\n".join(lines)
+
+
+def to_json(paths: Sequence[Path], target: Path, poses: Sequence[ScanPose]) -> str:
+    """Format poses for programs."""
+    scans = [
+        {"scan": str(path), **asdict(pose), "transform": pose.transform.tolist()}
+        for path, pose in zip(paths, poses, strict=True)
+    ]
+    return json.dumps({"target": str(target), "scans": scans}, indent=1) + "\n"
+
+
+@dataclass(frozen=True)
+class _Edge:
+    """A registration of scan `source` onto scan `target`."""
+
+    source: int
+    target: int
+    transform: np.ndarray  # (4, 4)
+    confidence: float
+
+    def seen_from(self, index: int) -> tuple[int, np.ndarray]:
+        """Return the other scan and the transform of scan `index` onto it."""
+        if index == self.source:
+            return self.target, self.transform
+        return self.source, np.linalg.inv(self.transform)
+
+
+class _PoseGraph:
+    """Poses of scans, kept as rotation and image of the centroid: exact far from the origin.
+
+    Args:
+        clouds: (N, 3) each; the last one's pose is the identity.
+        edges: registrations of pairs.
+    """
+
+    def __init__(self, clouds: Sequence[np.ndarray], edges: Sequence[_Edge]) -> None:
+        self.edges, self.last = edges, len(clouds) - 1
+        self.centres = np.stack([cloud.mean(0) for cloud in clouds])
+        sizes = [np.linalg.norm(c - c.mean(0), axis=1).max() for c in clouds]
+        self.tolerance = _SHARE * float(np.mean(sizes))
+        self.rotations = np.stack([np.eye(3)] * len(clouds))
+        self.images = self.centres.copy()  # of the centroids, in the last scan's frame
+        self.confidence = np.ones(len(clouds))
+        self._span()
+        for _ in range(_SWEEPS):
+            for index in range(self.last):
+                self._average(index)
+
+    def pose(self, index: int) -> ScanPose:
+        """Return the pose of a scan."""
+        transform = np.eye(4)
+        transform[:3, :3] = self.rotations[index]
+        transform[:3, 3] = self.images[index] - self.rotations[index] @ self.centres[index]
+        confidence, mine = float(self.confidence[index]), self._edges_of(index)
+        agree = sum(self._agrees(index, *self._predict(index, edge)) for edge in mine)
+        verdict = "aligned"
+        if confidence < MIN_CONFIDENCE:
+            verdict = f"doubtful: {agree} of {len(mine)} registrations agree"
+        return ScanPose(transform, confidence, agree, verdict)
+
+    def _edges_of(self, index: int) -> list[_Edge]:
+        return [edge for edge in self.edges if index in (edge.source, edge.target)]
+
+    def _predict(self, index: int, edge: _Edge) -> tuple[np.ndarray, np.ndarray]:
+        """Predict a scan's rotation and the image of its centroid from the scan across an edge."""
+        other, transform = edge.seen_from(index)
+        offset = transform[:3, :3] @ self.centres[index] + transform[:3, 3] - self.centres[other]
+        rotation = self.rotations[other]
+        return rotation @ transform[:3, :3], self.images[other] + rotation @ offset
+
+    def _agrees(self, index: int, rotation: np.ndarray, image: np.ndarray) -> bool:
+        """Tell whether a prediction is near a scan's pose."""
+        turn = Rotation.from_matrix(rotation @ self.rotations[index].T).magnitude()
+        off = np.linalg.norm(image - self.images[index])
+        return bool(np.degrees(turn) < _ANGLE_DEG and off < self.tolerance)
+
+    def _span(self) -> None:
+        """Place the scans one by one, always over the surest registration to a placed one."""
+        placed = {self.last}
+        while len(placed) <= self.last:
+            across = [e for e in self.edges if (e.source in placed) != (e.target in placed)]
+            edge = max(across, key=lambda e: e.confidence)
+            index = edge.target if edge.source in placed else edge.source
+            other, _ = edge.seen_from(index)
+            self.rotations[index], self.images[index] = self._predict(index, edge)
+            self.confidence[index] = min(edge.confidence, self.confidence[other])
+            placed.add(index)
+
+    def _average(self, index: int) -> None:
+        """Move a scan to the mean of the predictions that agree with its pose, by confidence."""
+        predictions = [(*self._predict(index, e), e.confidence) for e in self._edges_of(index)]
+        agreeing = [p for p in predictions if self._agrees(index, p[0], p[1])]
+        if not agreeing:
+            return
+        rotations, images, weights = map(np.array, zip(*agreeing, strict=True))
+        self.rotations[index] = Rotation.from_matrix(rotations).mean(weights).as_matrix()
+        self.images[index] = np.average(images, 0, weights)
