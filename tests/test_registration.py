@@ -289,9 +289,9 @@ def _frame(animation, at):
     return animation.convert("RGB")
 
 
-@pytest.mark.parametrize("model", ["ransac", "fgr"])
+@pytest.mark.parametrize("model", ["ransac", "ransac17", "fgr", "kiss"])
 def test_classical_pipelines_give_a_motion(pair, model):
-    pytest.importorskip("open3d")
+    pytest.importorskip("kiss_matcher" if model == "kiss" else "open3d")
     _, source, target, _ = pair
     result = corrmat.register(source, target, model=model)
     assert result.transform.shape == (4, 4)
@@ -303,6 +303,9 @@ def test_without_open3d_the_classical_pipelines_say_what_to_install(pair, monkey
     monkeypatch.setitem(sys.modules, "open3d", None)
     with pytest.raises(CorrmatError, match=r"pip install open3d"):
         corrmat.register(source, target, model="ransac")
+    monkeypatch.setitem(sys.modules, "kiss_matcher", None)
+    with pytest.raises(CorrmatError, match=r"pip install kiss-matcher"):
+        corrmat.register(source, target, model="kiss")
 
 
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium at hand")

@@ -1,13 +1,17 @@
 """Trained arms in the package: they load, and they match what their records say."""
 
 import json
+import sys
+import types
 
 import pytest
+import safetensors.torch
 import torch
 from conftest import ROOT
 
 import corrmat
 from corrmat import weights
+from corrmat.cli import main
 from corrmat.data.datamodule import PairDataset
 from corrmat.errors import CorrmatError
 from corrmat.metrics import RegistrationMetrics
@@ -61,3 +65,47 @@ def test_a_shipped_arm_matches_as_its_record_says(model):
     share = float(correct.sum() / matchable.sum())
     recorded = expected.num_correct[:PAIRS].sum() / expected.num_matchable[:PAIRS].sum()
     assert share == pytest.approx(recorded, abs=1e-3)
+
+
+@pytest.mark.parametrize("model", ["corrmat", "1.2/DCP_corr"])
+def test_an_exported_model_is_loaded_from_its_folder_and_from_the_hub(model, tmp_path, monkeypatch):
+    assert main(["export", str(tmp_path / "mine"), "--model", model]) == 0
+    assert {path.name for path in (tmp_path / "mine").iterdir()} == {
+        "README.md", "config.json", "model.safetensors",
+    }  # fmt: skip
+    assert (tmp_path / "mine" / "README.md").read_text().startswith("---\nlibrary_name: corrmat")
+    original = corrmat.load_model(model).state_dict()
+    asked = []
+
+    def download(repository, filename):
+        asked.append(repository)
+        return str(tmp_path / "mine" / filename)
+
+    hub = types.SimpleNamespace(hf_hub_download=download)
+    monkeypatch.setitem(sys.modules, "huggingface_hub", hub)
+    for place in (tmp_path / "mine", "hf:somebody/mine"):
+        loaded = corrmat.load_model(place).state_dict()
+        assert all(torch.equal(loaded[name], original[name]) for name in original)
+    assert asked == ["somebody/mine"]
+
+
+def test_what_cannot_be_exported_or_loaded_is_said(tmp_path, monkeypatch):
+    with pytest.raises(CorrmatError, match="no shipped model '1.2/DPC'; models: corrmat, 1.2/DCP"):
+        weights.export_model("1.2/DPC", tmp_path)
+    safetensors.torch.save_file({"x": torch.zeros(1)}, tmp_path / "model.safetensors")
+    with pytest.raises(CorrmatError, match="is no model of corrmat"):
+        corrmat.load_model(tmp_path)
+    (tmp_path / "model.safetensors").write_bytes(b"nothing")
+    with pytest.raises(CorrmatError, match="is no model of corrmat"):
+        corrmat.load_model(tmp_path)
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
+    with pytest.raises(CorrmatError, match="pip install huggingface_hub"):
+        corrmat.load_model("hf:somebody/mine")
+
+    def unreachable(repository, filename):
+        raise OSError("no network\nmore")
+
+    hub = types.SimpleNamespace(hf_hub_download=unreachable)
+    monkeypatch.setitem(sys.modules, "huggingface_hub", hub)
+    with pytest.raises(CorrmatError, match="hf:somebody/mine cannot be downloaded: no network"):
+        corrmat.load_model("hf:somebody/mine")

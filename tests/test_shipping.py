@@ -37,7 +37,7 @@ def test_a_checkpoint_becomes_the_weights_of_the_package(checkpoint, package, ca
     shipping.ship(checkpoint)
     assert package.name in capsys.readouterr().out
     header = weights.shipped_metadata()
-    assert header["method"] == "InvariantCorr"
+    assert header["method"] == "Invariant_corr"
     assert json.loads(header["network"]) == NETWORK
     calibration = weights.shipped_calibration()
     assert (len(calibration.both), len(calibration.agreement)) == (3, 2)

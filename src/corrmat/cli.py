@@ -267,6 +267,15 @@ def _register_several(options: Namespace) -> int:
     return 0
 
 
+def _export(options: Namespace) -> int:
+    """Write shipped weights as a folder."""
+    from corrmat.weights import export_model
+
+    export_model(options.model, options.folder)
+    print(f"{options.folder}: model.safetensors, config.json and README.md of {options.model}")
+    return 0
+
+
 def _example(options: Namespace) -> int:
     """Write two scans to try."""
     from corrmat.registration.example import write_example
@@ -371,6 +380,7 @@ _COMMANDS: dict[str, Callable[[Namespace], int]] = {
     "evaluate": _evaluate,
     "compare": _compare,
     "register": _register,
+    "export": _export,
     "example": _example,
     "data": _data,
     "robustness": _robustness,

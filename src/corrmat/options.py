@@ -67,7 +67,9 @@ COMPARE_EPILOG = """examples:
   corrmat compare corrmat,dcp_v1.t7 --data modelnet40 --root /data --points 1024
 
 protocols: real: disjoint samples, noise, both clouds cropped and with outliers, normals
-estimated; clean: the same without crop and outliers; paper: experiment 1.2's pairs."""
+estimated; views: what two depth cameras see, up to 60 degrees apart; clean: real without crop
+and outliers; paper: experiment 1.2's pairs. kiss is KISS-Matcher, ransac17 RANSAC with as many
+candidates as corrmat has."""
 
 REGISTER_EPILOG = """examples:
   corrmat register scan1.ply scan2.ply
@@ -165,6 +167,14 @@ def build_parser(with_settings: Sequence[str] = ()) -> ArgumentParser:
             "SOURCE [SOURCE ...] TARGET",
         )
     )
+    export = add(
+        "export", "write shipped weights as a folder for the Hugging Face Hub",
+        "examples:\n  corrmat export mine && hf upload somebody/mine mine\n"
+        "  corrmat register a.ply b.ply --model mine\n"
+        "  corrmat register a.ply b.ply --model hf:somebody/mine", "FOLDER",
+    )  # fmt: skip
+    export.add_argument("folder", type=Path, help="for model.safetensors, config.json, README.md")
+    export.add_argument("--model", default="corrmat", help="corrmat, 1.2/DCP_corr, ...")
     example = add("example", "write two scans to try register on", words="FOLDER")
     example.add_argument("folder", type=Path, help="for source.ply, target.ply and truth.json")
     robustness = add("robustness", "figure 2: wrong matches against a wrong rotation vector")
@@ -269,7 +279,8 @@ def _add_register_options(parser: ArgumentParser) -> None:
     parser.add_argument("--gif", type=Path, help="write an animation of the same")
     parser.add_argument(
         "--model", default="corrmat",
-        help="corrmat (the shipped weights), icp, ransac, fgr, kiss, or a checkpoint file",
+        help="corrmat (the shipped weights), icp, ransac, fgr, kiss, a checkpoint file, a folder "
+        "of corrmat export, or hf:name/model",
     )  # fmt: skip
     parser.add_argument(
         "--refine", type=Literal["icp", "none"], default="icp", help="refinement after the model"

@@ -4,6 +4,7 @@ Nothing here executes code from a file: tensors are read by safetensors, or by t
 weights only, which refuses every other kind of object.
 """
 
+import importlib
 import json
 import pickle
 import re
@@ -95,6 +96,7 @@ def load_reference(kind: str, state_dict: Mapping[str, Any], **hparams: Any) -> 
     return load_state(_BUILD[kind](ours, hparams), ours)
 
 
+_MODEL_FILE = "model.safetensors"  # of a folder, as the Hugging Face Hub has it
 SHIPPED = Path(__file__).parent / "shipped" / "corrmat.safetensors"
 
 
@@ -109,22 +111,17 @@ def load_model(model: str | Path = "corrmat") -> nn.Module:
 
     Args:
         model: "corrmat" for the weights that `corrmat register` uses; one of `shipped_models`,
-            e.g. "1.2/DCP_corr"; or a file: a checkpoint of `corrmat fit`, or the original
+            e.g. "1.2/DCP_corr"; a folder that `export_model` has written, or "hf:name/model" for
+            one on the Hugging Face Hub; or a file: a checkpoint of `corrmat fit`, or the original
             authors' .t7 or .pth of DCP, RPMNet, PCRNet or PCRNet_corr.
 
     Raises:
         CorrmatError: there is no such file, it holds anything but tensors, or they fit no
             network; the message names those that do not.
     """
-    if str(model) == "corrmat":
-        network = InvariantNetwork(**json.loads(shipped_metadata()["network"]))
-        return load_state(network, safetensors.torch.load_file(SHIPPED))
-    if str(model) in shipped_models():
-        from corrmat.methods import METHODS  # imports Lightning, which `register` does not need
-
-        about = shipped_metadata(str(model))
-        network = METHODS[about["method"]].network_type(**json.loads(about["network"]))
-        return load_state(network, safetensors.torch.load_file(_shipped_file(str(model))))
+    file = _safetensors_file(str(model))
+    if file is not None:
+        return _load_safetensors(file)
     path = Path(model)
     content = _read_checkpoint(path)
     if "method" in content:
@@ -141,6 +138,85 @@ def shipped_metadata(model: str = "corrmat") -> dict[str, str]:
     """
     with safetensors.safe_open(_shipped_file(model), framework="pt") as file:
         return file.metadata()
+
+
+def export_model(model: str, folder: Path) -> None:
+    """Write shipped weights as a folder that the Hugging Face Hub understands.
+
+    They are model.safetensors, config.json and a model card, README.md.
+
+    Args:
+        model: "corrmat", or one of `shipped_models`.
+        folder: to write into; it is made.
+
+    Raises:
+        CorrmatError: no such weights are shipped.
+    """
+    if model != "corrmat" and model not in shipped_models():
+        names = ", ".join(["corrmat", *shipped_models()])
+        raise CorrmatError(f"no shipped model {model!r}; models: {names}")
+    about = shipped_metadata(model)
+    config = {"library_name": "corrmat", **about, "network": json.loads(about["network"])}
+    folder.mkdir(parents=True, exist_ok=True)
+    replace_bytes(folder / _MODEL_FILE, _shipped_file(model).read_bytes())
+    replace_bytes(folder / "config.json", (json.dumps(config, indent=1) + "\n").encode())
+    replace_bytes(folder / "README.md", _model_card(model, about).encode())
+
+
+def _model_card(model: str, about: Mapping[str, str]) -> str:
+    """Write the card of a shipped model, with the Hub's metadata in front."""
+    front = "---\nlibrary_name: corrmat\nlicense: mit\ntags: [point-cloud-registration]\n---\n\n"
+    if model == "corrmat":
+        return front + (SHIPPED.parent / "MODEL_CARD.md").read_text("utf-8")
+    return (
+        f"{front}# {model}\n\n{about['method']} of experiment {model.split('/')[0]} of "
+        f"*Correspondence Matrices are Underrated* (3DV 2020), reproduced. Its record: "
+        f"results/{about['record']}, commit {about['commit']}.\n\n"
+        "    network = corrmat.load_model(folder)\n"
+    )
+
+
+def _safetensors_file(model: str) -> Path | None:
+    """Find the safetensors file of a model: shipped, exported or on the Hub; None for others."""
+    if model == "corrmat" or model in shipped_models():
+        return _shipped_file(model)
+    if model.startswith("hf:"):
+        return _download(model.removeprefix("hf:"))
+    exported = Path(model) / _MODEL_FILE
+    return exported if exported.is_file() else None
+
+
+def _download(repository: str) -> Path:
+    """Download a model from the Hugging Face Hub, or find it in the Hub's cache."""
+    try:
+        hub = importlib.import_module("huggingface_hub")
+    except ImportError as error:
+        raise CorrmatError(f"hf: models need pip install huggingface_hub ({error})") from error
+    try:
+        return Path(hub.hf_hub_download(repository, _MODEL_FILE))
+    except Exception as error:  # no network, no such repository, a name that is none
+        reason = str(error).strip().splitlines()[0]
+        raise CorrmatError(f"hf:{repository} cannot be downloaded: {reason}") from error
+
+
+def _load_safetensors(path: Path) -> nn.Module:
+    """Load a file that `ship_network` has written."""
+    try:
+        with safetensors.safe_open(path, framework="pt") as file:
+            about = file.metadata() or {}
+        hparams = json.loads(about["network"])
+        network = _network_type(about["method"])(**hparams)
+    except (safetensors.SafetensorError, KeyError, ValueError, TypeError) as error:
+        raise CorrmatError(f"{path} is no model of corrmat ({error!r})") from error
+    return load_state(network, safetensors.torch.load_file(path))
+
+
+def _network_type(method: str) -> type[nn.Module]:
+    if method == "Invariant_corr":  # Lightning, which the others import, takes seconds
+        return InvariantNetwork
+    from corrmat.methods import METHODS
+
+    return METHODS[method].network_type
 
 
 def _shipped_file(model: str) -> Path:

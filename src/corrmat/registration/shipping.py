@@ -22,10 +22,10 @@ def ship(checkpoint: Path) -> None:
     Args:
         checkpoint: of `corrmat fit`.
     """
-    method, hparams, network = weights.checkpoint_network(checkpoint)
+    _, hparams, network = weights.checkpoint_network(checkpoint)
     calibration = calibrate(checkpoint)
     path = weights.ship_network(
-        "corrmat", method, hparams, network,
+        "corrmat", "Invariant_corr", hparams, network,
         commit=str(commit()), calibration=json.dumps(calibration),
     )  # fmt: skip
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
