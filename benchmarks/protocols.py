@@ -1,4 +1,4 @@
-"""The table of `corrmat register` in README.md: every model on every protocol, into results/.
+"""The tables of `corrmat register`: every model on every protocol, into results/register.
 
 make protocols ROOT=folder-of-modelnet40
 """
@@ -10,14 +10,15 @@ from pathlib import Path
 from corrmat.cli import main
 
 RESULTS = Path(__file__).resolve().parents[1] / "results" / "register"
-MODELS = "corrmat,ransac,fgr,icp"
+MODELS = "corrmat,ransac,ransac17,fgr,kiss,icp"
+POINTS = {"real": (512, 1024), "views": (512,), "clean": (512, 1024)}
 
 
 def run(root: Path | None) -> None:
     """Evaluate and record each of them; the real data only where they are at hand."""
     for data in ("shapes", *(("modelnet40",) if root else ())):
-        for protocol in ("real", "clean"):
-            for points in (512, 1024):
+        for protocol, sizes in POINTS.items():
+            for points in sizes:
                 name = f"{protocol}-{data}-{points}"
                 print(f"\n{name}")
                 words = [MODELS, "--protocol", protocol, "--data", data, "--points", str(points)]

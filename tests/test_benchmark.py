@@ -1,6 +1,7 @@
 """Models against each other on the same frozen pairs."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from corrmat.cli import main
 from corrmat.data import registry
 from corrmat.errors import CorrmatError
 from corrmat.registration import benchmark
-from corrmat.reporting import documents
+from corrmat.reporting import comparisons
 
 
 @pytest.fixture
@@ -65,9 +66,27 @@ def test_the_command_prints_one_table_and_writes_a_record(pairs, tmp_path, capsy
     assert record["pairs"] == 4
     assert len(record["models"]["icp"]["per_pair"]["rotation_error_deg"]) == 4
     assert record["models"]["corrmat"]["recall_5deg"] >= record["models"]["icp"]["recall_5deg"]
-    table = documents.register_table(tmp_path / "results")
-    assert table.splitlines()[0] == "| pairs | data | points | icp | corrmat |"
-    assert table.splitlines()[2].startswith("| clean | shapes | 256 | ")
+    summary = comparisons.comparison_summary(tmp_path / "results", 256)
+    assert summary.splitlines()[0] == "| pairs | data | icp | corrmat |"
+    assert re.match(
+        r"\| clean \| shapes \| \d+% \| \d+% \(\d+ to \d+\) \|", summary.splitlines()[2]
+    )
+    rows = comparisons.comparison_table(tmp_path / "results").splitlines()[2:]
+    assert [row.split(" | ")[3] for row in rows] == ["icp", "corrmat"]
+    confidence = comparisons.confidence_table(tmp_path / "results")
+    assert re.search(r"Called aligned .*: \d+\.\d% of 4 pairs", confidence)
+
+
+def test_calibration_intervals_and_paired_test_by_hand():
+    promised = np.array([0.05, 0.05, 0.95, 0.95])
+    error = comparisons.expected_calibration_error(promised, np.array([False, True, True, True]))
+    assert error == pytest.approx((0.9 + 0.1) / 4)
+    ours = np.array([True] * 9 + [False])
+    assert comparisons._wilson(ours) == "60 to 98"
+    theirs = np.array([True] * 3 + [False] * 6 + [True])
+    # Six pairs for ours, one against: 2 (1 + 7) / 2^7.
+    assert comparisons._mcnemar(ours, theirs) == pytest.approx(0.125)
+    assert comparisons._mcnemar(ours, ours) == 1
 
 
 def test_what_cannot_be_compared_is_said(pairs):

@@ -1,18 +1,21 @@
 """Rewrites the tables of README.md and docs/, and redraws their pictures, from results/."""
 
-import itertools
 import json
 from collections.abc import Callable
 from pathlib import Path
 
 from corrmat.errors import CorrmatError
 from corrmat.files import replace_text
-from corrmat.metrics import ADDS_THRESHOLD
 from corrmat.reporting.claims import headline, markdown_claims, read_evidence
+from corrmat.reporting.comparisons import (
+    comparison_summary,
+    comparison_table,
+    confidence_table,
+    networks_table,
+)
 from corrmat.reporting.record import Record, read_records
 from corrmat.reporting.tables import markdown_row, markdown_summary, markdown_tables
 from corrmat.reporting.writer import draw_record
-from corrmat.weights import shipped_calibration
 
 HEADLINES = ("1.2", "1.3", "2.1", "2.2", "3.2", "outliers")  # experiments of README's table
 _SCALE_ORDER = {"laptop": 0, "overnight": 1, "paper": 2}
@@ -58,61 +61,6 @@ def rates_table(results: Path) -> str:
                 cells.append(f"**{cell}**" if rate["lr"] == result["chosen"] else cell)
             pairs = f"{result['rates'][0]['pairs_seen']:,}"
             lines.append(markdown_row([sweep["id"], arm, pairs, *cells]))
-    return "\n".join(lines)
-
-
-def register_table(results: Path) -> str:
-    """Build the table of `corrmat register`: a row a set of pairs, a column a model."""
-    records = [json.loads(path.read_text()) for path in sorted(results.glob("register/*-*.json"))]
-    if not records:
-        return "No comparison is recorded; `make protocols` makes them."
-    models = list(records[0]["models"])
-    heads = ["pairs", "data", "points", *models]
-    lines = [markdown_row(heads), "|" + "---|" * len(heads)]
-    for record in sorted(records, key=lambda r: (r["protocol"] != "real", r["data"], r["points"])):
-        cells = []
-        for model in models:
-            row = record["models"].get(model)
-            recalls = row and f"{row['recall_5deg']:.0%} / {row['recall_adds']:.0%}"
-            cells.append(f"{recalls}, {row['ms']:.0f} ms" if row else "")
-        start = [record["protocol"], record["data"], str(record["points"])]
-        lines.append(markdown_row([*start, *cells]))
-    return "\n".join(lines)
-
-
-def networks_table(results: Path) -> str:
-    """Build the table of other networks of this project in the shipped one's place."""
-    path = results / "register" / "networks.json"
-    if not path.is_file():
-        return "No comparison is recorded."
-    lines = [markdown_row(["network", "recall at 5 deg", "recall ADD-S"]), "|---|---|---|"]
-    for name, row in json.loads(path.read_text())["models"].items():
-        parts = Path(name).parts
-        label = f"{parts[-2]}, experiment {parts[-3]}" if len(parts) > 2 else f"{name} (shipped)"
-        recalls = [f"{row['recall_5deg']:.0%}", f"{row['recall_adds']:.0%}"]
-        lines.append(markdown_row([label, *recalls]))
-    return "\n".join(lines)
-
-
-def confidence_table(results: Path) -> str:
-    """Build the table of what the confidence promised and how often the clouds were aligned."""
-    calibration = shipped_calibration()
-    heads = ["data", "confidence", "pairs", "promised", "aligned"]
-    lines = [markdown_row(heads), "|---|---|---|---|---|"]
-    for data in ("shapes", "modelnet40"):
-        promised: list[float] = []
-        aligned: list[bool] = []
-        for path in sorted((results / "register").glob(f"*-{data}-*.json")):
-            pairs = json.loads(path.read_text())["models"]["corrmat"]["per_pair"]
-            scores = zip(pairs["agreement"], pairs["support"], strict=True)
-            promised += [calibration.confidence(*score) for score in scores]
-            aligned += [distance < ADDS_THRESHOLD for distance in pairs["adds"]]
-        for low, high in itertools.pairwise((0, 0.25, 0.5, 0.75, 1)):
-            inside = [i for i, value in enumerate(promised) if low <= value < high]
-            if inside:
-                means = [sum(v[i] for i in inside) / len(inside) for v in (promised, aligned)]
-                cells = [f"{low:.0%} to {high:.0%}", str(len(inside)), *(f"{m:.0%}" for m in means)]
-                lines.append(markdown_row([data, *cells]))
     return "\n".join(lines)
 
 
@@ -162,11 +110,12 @@ def _bench_row(row: dict[str, float | str]) -> str:
 # document, mark in it, content from the records and the folder results/
 TABLES: tuple[tuple[str, str, Callable[[list[Record], Path], str]], ...] = (
     ("README.md", "headline", lambda _, results: headline_table(results)),
-    ("README.md", "register", lambda _, results: register_table(results)),
+    ("README.md", "register", lambda _, results: comparison_summary(results)),
     ("docs/reproduction.md", "results", lambda records, _: markdown_summary(records)),
     ("docs/reproduction.md", "rates", lambda _, results: rates_table(results)),
     ("docs/reproduction.md", "tables", lambda records, _: markdown_tables(records)),
     ("docs/claims.md", "claims", lambda _, results: claims_table(results)),
+    ("docs/register.md", "comparison", lambda _, results: comparison_table(results)),
     ("docs/register.md", "networks", lambda _, results: networks_table(results)),
     ("docs/register.md", "confidence", lambda _, results: confidence_table(results)),
     ("docs/speed.md", "bench", lambda _, results: bench_table(results)),

@@ -1,0 +1,149 @@
+"""Tables of `corrmat compare`'s records: the shipped weights beside the classical pipelines."""
+
+import itertools
+import json
+from pathlib import Path
+
+import numpy as np
+from scipy import stats
+
+from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG
+from corrmat.reporting.tables import markdown_row
+from corrmat.weights import shipped_calibration
+
+OURS = "corrmat"
+_PROTOCOLS = ("real", "views", "clean")  # in the order of the tables
+_BINS = 10  # of the expected calibration error
+
+
+def comparison_summary(results: Path, points: int = 512) -> str:
+    """Build README's table: recall at 5 degrees of every model, ours with its interval."""
+    records = [r for r in _read_comparisons(results) if r["points"] == points]
+    if not records:
+        return "No comparison is recorded; `make protocols` makes them."
+    models = list(records[0]["models"])
+    heads = ["pairs", "data", *models]
+    lines = [markdown_row(heads), "|" + "---|" * len(heads)]
+    for record in records:
+        cells = []
+        for model in models:
+            right = _within_angle(record["models"][model])
+            interval = f" ({_wilson(right)})" if model == OURS else ""
+            cells.append(f"{right.mean():.0%}{interval}")
+        lines.append(markdown_row([record["protocol"], record["data"], *cells]))
+    return "\n".join(lines)
+
+
+def comparison_table(results: Path) -> str:
+    """Build the table of docs/register.md: a row a set of pairs and model, with intervals.
+
+    The intervals are Wilson's, at 95 %. The p value is the exact McNemar test's: that the model
+    is within 5 degrees as often as ours, on the same pairs.
+    """
+    heads = ["pairs", "data", "points", "model", "within 5 deg", "ADD-S", "p", "ms a pair"]
+    lines = [markdown_row(heads), "|" + "---|" * len(heads)]
+    for record in _read_comparisons(results):
+        ours = _within_angle(record["models"][OURS])
+        for model, row in record["models"].items():
+            right = _within_angle(row)
+            recalls = [f"{r.mean():.0%} ({_wilson(r)})" for r in (right, _aligned(row))]
+            p = "" if model == OURS else f"{_mcnemar(ours, right):.2g}"
+            start = [record["protocol"], record["data"], str(record["points"]), model]
+            lines.append(markdown_row([*start, *recalls, p, f"{row['ms']:.0f}"]))
+    return "\n".join(lines)
+
+
+def networks_table(results: Path) -> str:
+    """Build the table of other networks of this project in the shipped one's place."""
+    path = results / "register" / "networks.json"
+    if not path.is_file():
+        return "No comparison is recorded."
+    lines = [markdown_row(["network", "recall at 5 deg", "recall ADD-S"]), "|---|---|---|"]
+    for name, row in json.loads(path.read_text())["models"].items():
+        parts = Path(name).parts
+        label = f"{parts[-2]}, experiment {parts[-3]}" if len(parts) > 2 else f"{name} (shipped)"
+        recalls = [f"{row['recall_5deg']:.0%}", f"{row['recall_adds']:.0%}"]
+        lines.append(markdown_row([label, *recalls]))
+    return "\n".join(lines)
+
+
+def confidence_table(results: Path) -> str:
+    """Build the table of what the confidence promised and how often the clouds were aligned.
+
+    Below it stand the expected calibration error and the share of wrong verdicts "aligned".
+    """
+    heads = ["data", "confidence", "pairs", "promised", "aligned"]
+    lines = [markdown_row(heads), "|---|---|---|---|---|"]
+    everything = []
+    for data in ("shapes", "modelnet40"):
+        records = [r["models"][OURS] for r in _read_comparisons(results) if r["data"] == data]
+        if not records:
+            continue
+        promised = np.concatenate([_confidence(row) for row in records])
+        aligned = np.concatenate([_aligned(row) for row in records])
+        everything.append((promised, aligned))
+        for low, high in itertools.pairwise((0, 0.25, 0.5, 0.75, 1.01)):
+            inside = (low <= promised) & (promised < high)
+            if inside.any():
+                means = [f"{values[inside].mean():.0%}" for values in (promised, aligned)]
+                span = f"{low:.0%} to {min(high, 1):.0%}"
+                lines.append(markdown_row([data, span, str(inside.sum()), *means]))
+    if everything:
+        promised, aligned = map(np.concatenate, zip(*everything, strict=True))
+        wrong = ((promised >= 0.5) & ~aligned).mean()
+        error = expected_calibration_error(promised, aligned)
+        lines += [
+            "",
+            f"Expected calibration error over {_BINS} bins: {error:.3f}. Called aligned but not "
+            f"lying on each other: {wrong:.1%} of {len(promised)} pairs.",
+        ]
+    return "\n".join(lines)
+
+
+def expected_calibration_error(promised: np.ndarray, happened: np.ndarray) -> float:
+    """Compute the mean gap between promise and outcome over bins of equal width, by pairs.
+
+    Args:
+        promised: (n,) chances in [0, 1].
+        happened: (n,) bool.
+    """
+    bins = np.minimum((promised * _BINS).astype(int), _BINS - 1)
+    gaps = [abs((promised - happened)[bins == b].sum()) for b in range(_BINS)]
+    return float(sum(gaps) / len(promised))
+
+
+def _read_comparisons(results: Path) -> list[dict]:
+    """Read the comparisons of all protocols, in the order of the tables."""
+    paths = (results / "register").glob("*-*-*.json")
+    records = [json.loads(path.read_text()) for path in paths]
+    known = [record for record in records if record["protocol"] in _PROTOCOLS]
+    return sorted(known, key=lambda r: (_PROTOCOLS.index(r["protocol"]), r["data"], r["points"]))
+
+
+def _within_angle(row: dict) -> np.ndarray:
+    return np.array(row["per_pair"]["rotation_error_deg"]) < RECALL_DEG
+
+
+def _aligned(row: dict) -> np.ndarray:
+    return np.array(row["per_pair"]["adds"]) < ADDS_THRESHOLD
+
+
+def _confidence(row: dict) -> np.ndarray:
+    """Compute what the shipped calibration promised for each pair."""
+    calibration = shipped_calibration()
+    scores = zip(row["per_pair"]["agreement"], row["per_pair"]["support"], strict=True)
+    return np.array([calibration.confidence(*score) for score in scores])
+
+
+def _wilson(right: np.ndarray) -> str:
+    """Format Wilson's 95 % interval of a share, in per cent."""
+    interval = stats.binomtest(int(right.sum()), len(right)).proportion_ci(0.95, "wilson")
+    return f"{100 * interval.low:.0f} to {100 * interval.high:.0f}"
+
+
+def _mcnemar(one: np.ndarray, other: np.ndarray) -> float:
+    """Return the p value that two models are right equally often on the same pairs."""
+    only_one, only_other = int((one & ~other).sum()), int((other & ~one).sum())
+    if not only_one + only_other:
+        return 1.0
+    return float(stats.binomtest(only_one, only_one + only_other).pvalue)
