@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogFormatter, NullFormatter
@@ -37,6 +38,15 @@ _STYLES: dict[Source, dict[str, Any]] = {
 }
 
 
+class RivalResult(NamedTuple):
+    """Where another arm than the snapshot's puts the source."""
+
+    arm: str
+    rotation: list[list[float]]  # (3, 3)
+    translation: list[float]  # (3,)
+    rotation_error_deg: float
+
+
 class CurveSeries(NamedTuple):
     """An arm's values, those that the paper reports for it, or a baseline's."""
 
@@ -60,6 +70,7 @@ class Panel(NamedTuple):
     log_x: bool
     log_y: bool
     series: list[CurveSeries]
+    bars: bool = False
 
 
 def arm_colours(record: Record) -> dict[str, str]:
@@ -127,7 +138,8 @@ def _subset_panel(record: Record, name: str, part: str) -> Panel:
                 x, y = map(list, zip(*available, strict=True))
                 series.append(CurveSeries(arm, colour, x, y, source))
     xlabel = "initial misalignment, deg" if part == "bands" else "outliers in the test, %"
-    return Panel(title, xlabel, False, name != "match_accuracy", series)
+    log_y = name != "match_accuracy"
+    return Panel(title, xlabel, False, log_y, series, bars=part == "bands")
 
 
 def _arms(record: Record) -> Iterator[tuple[str, str, ArmResult]]:
@@ -155,29 +167,56 @@ def draw_curves(record: Record, path: Path) -> None:
     rows, columns = grid(len(all_panels))
     figure = Figure(figsize=(3.75 * columns, 3.2 * rows + 0.6), layout="constrained")
     figure.suptitle(f"{record.id}  {record.title}  ({record.scale}, {record.data})")
+    training = [s for p in all_panels if p.xlabel == _PAIRS for s in p.series]
+    ends = [value for series in training for value in (series.x[0], series.x[-1])]
     for axes, panel in zip(figure.subplots(rows, columns).flat, all_panels, strict=True):
-        for series in panel.series:
+        if panel.bars:
+            _draw_bars(axes, panel.series)
+        for series in [] if panel.bars else panel.series:
             marker = "." if series.source == "arm" and len(series.x) <= 40 else ""
             style = _STYLES[series.source] | {"marker": marker}
             axes.plot(series.x, series.y, color=series.colour, label=series.label, **style)
-        if panel.xlabel == _PAIRS:
-            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         if panel.log_x:
             axes.set_xscale("log")
             axes.xaxis.set_minor_formatter(NullFormatter())
+        if panel.xlabel == _PAIRS and ends:
+            axes.set_xlim(0.9 * min(ends) if panel.log_x else 0, 1.05 * max(ends))
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         if panel.log_y:
             axes.set_yscale("log")
             axes.yaxis.set_major_formatter("{x:g}")
             axes.yaxis.set_minor_formatter(_PlainLogFormatter(minor_thresholds=(1, 0.4)))
         axes.set(title=panel.title, xlabel=panel.xlabel)
         axes.grid(alpha=0.3)
-    lines = {line.get_label(): line for axes in figure.axes for line in axes.lines}
-    figure.legend(handles=list(lines.values()), loc="outside lower center", ncols=4)
+    entries = [axes.get_legend_handles_labels() for axes in figure.axes]
+    drawn = {
+        label: handle
+        for handles, labels in entries
+        for handle, label in zip(handles, labels, strict=True)
+    }
+    figure.legend(drawn.values(), drawn.keys(), loc="outside lower center", ncols=4)
     save(figure, path)
 
 
-def draw_matches(snapshot: PairSnapshot, title: str, path: Path) -> None:
-    """Draw a pair before and after, right matches green, wrong ones orange (paper, figure 8).
+def _draw_bars(axes: Axes, series: list[CurveSeries]) -> None:
+    """Draw a bar for every band and arm, and a diamond where the paper's value is."""
+    arms = list(dict.fromkeys(s.arm for s in series))
+    for arm_series in series:
+        x = np.asarray(arm_series.x)
+        width = 0.8 * np.diff(x).min(initial=np.inf if len(x) > 1 else 1) / len(arms)
+        at = x + width * (arms.index(arm_series.arm) - (len(arms) - 1) / 2)
+        style: dict[str, Any] = {"color": arm_series.colour, "label": arm_series.label}
+        if arm_series.source == "arm":
+            axes.bar(at, arm_series.y, width, alpha=0.75, **style)
+        else:
+            style |= {"marker": "D", "s": 26, "edgecolors": "black", "zorder": 3}
+            axes.scatter(at, arm_series.y, **style)
+
+
+def draw_matches(
+    snapshot: PairSnapshot, title: str, path: Path, rival: RivalResult | None = None
+) -> None:
+    """Draw a pair before and after, right matches green, wrong ones orange (figures 8 and 9).
 
     The source is black and the target blue. Points called outliers have a ring, which is orange
     if they are inliers.
@@ -186,34 +225,52 @@ def draw_matches(snapshot: PairSnapshot, title: str, path: Path) -> None:
         snapshot: the pair.
         title: above the figure.
         path: of the PNG.
+        rival: where another arm puts the source, to be drawn between the two.
     """
-    before, *_, after = stages(_facing(snapshot))
-    boxes = [_box(_project(np.concatenate([s.source, s.target]))) for s in (before, after)]
+    view = principal_axes(np.asarray(snapshot.target))
+    before, *_, after = stages(_turned(snapshot, view))
+    right = f"{100 * match_accuracy(snapshot):.0f} % of the matches are right"
+    scenes = [(f"{snapshot.arm}: {right}", before)]
+    if rival is not None:
+        x = np.asarray(snapshot.source)
+        moved = (x @ np.asarray(rival.rotation).T + np.asarray(rival.translation)) @ view
+        none = np.zeros(len(x), bool)
+        scene = Stage(rival.arm, moved, after.target, np.zeros(len(x), np.int64), none)
+        scenes.append((f"{rival.arm}: {_degrees(rival.rotation_error_deg)} off", scene))
+    scenes.append((f"{snapshot.arm}: {_degrees(snapshot.rotation_error_deg)} off", after))
+    boxes = [_box(_project(np.concatenate([s.source, s.target]))) for _, s in scenes]
     widths = [min(max(box[0] / box[1], 1), 3) for box in boxes]  # room for the headings
-    height = min(1 + 10 / sum(widths), 6)
-    figure = Figure(figsize=(10, height), layout="constrained")
-    figure.suptitle(
-        f"{title}: {100 * match_accuracy(snapshot):.0f} % of the matches are right, "
-        f"rotation {snapshot.rotation_error_deg:.2g} deg off"
-    )
-    headings = "source, target set aside, matches", "registered"
-    both = figure.subplots(1, 2, width_ratios=widths)
-    for axes, stage, heading in zip(both, (before, after), headings, strict=True):
-        source, target = _project(stage.source), _project(stage.target)
-        axes.add_collection(_match_lines(stage, source, target))
-        axes.scatter(*target.T, s=22, color="#9ecae9", linewidths=0, label="target")
-        axes.scatter(*source.T, s=4, color="black", linewidths=0, label="source")
-        outlier = stage.called_outlier
-        if outlier.any():
-            rings = np.where(stage.correct[outlier], GREEN, RED)
-            axes.scatter(
-                *source[outlier].T, s=60, facecolors="none", edgecolors=rings,
-                label="called outlier",
-            )  # fmt: skip
-        axes.set(title=heading, aspect="equal")
-        axes.set_axis_off()
-    both[1].legend(fontsize="x-small", loc="best")
+    figure = Figure(figsize=(10, min(1 + 10 / sum(widths), 6)), layout="constrained")
+    figure.suptitle(title)
+    for axes, (heading, scene) in zip(
+        figure.subplots(1, len(scenes), width_ratios=widths), scenes, strict=True
+    ):
+        _draw_scene(axes, scene, has_matches=heading != scenes[1][0] or rival is None)
+        axes.set_title(heading, fontsize="medium")
+    figure.axes[-1].legend(fontsize="x-small", loc="best")
     save(figure, path)
+
+
+def _degrees(error: float) -> str:
+    """Format an angle to two digits, or to a whole degree."""
+    return f"{error:.0f} deg" if error >= 10 else f"{error:.2g} deg"
+
+
+def _draw_scene(axes: Axes, scene: Stage, *, has_matches: bool) -> None:
+    """Draw two clouds and, if there are any, the matches between them."""
+    source, target = _project(scene.source), _project(scene.target)
+    if has_matches:
+        axes.add_collection(_match_lines(scene, source, target))
+    axes.scatter(*target.T, s=22, color="#9ecae9", linewidths=0, label="target")
+    axes.scatter(*source.T, s=4, color="black", linewidths=0, label="source")
+    outlier = scene.called_outlier
+    if outlier.any():
+        rings = np.where(scene.correct[outlier], GREEN, RED).tolist()
+        axes.scatter(
+            *source[outlier].T, s=60, facecolors="none", edgecolors=rings, label="called outlier"
+        )
+    axes.set_aspect("equal")
+    axes.set_axis_off()
 
 
 def thin(points: np.ndarray, count: int) -> np.ndarray:
@@ -231,9 +288,8 @@ def principal_axes(points: np.ndarray) -> np.ndarray:
     return view * [1, np.linalg.det(view), 1]
 
 
-def _facing(snapshot: PairSnapshot) -> PairSnapshot:
-    """Turn a pair so that the principal axes of the target are those of the picture."""
-    view = principal_axes(np.asarray(snapshot.target))
+def _turned(snapshot: PairSnapshot, view: np.ndarray) -> PairSnapshot:
+    """Turn a pair so that the columns of `view` (3, 3) become the axes of the picture."""
     steps = [
         SnapshotStep(
             (view.T @ np.asarray(step.rotation) @ view).tolist(),

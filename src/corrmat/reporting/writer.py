@@ -100,7 +100,20 @@ def draw_record(folder: Path) -> None:
         snapshot = snapshots[len(snapshots) // 2]
         place = f"{record.scale}, {record.data}"
         title = f"{record.id} {snapshot.arm} ({place}), the {snapshot.rank} pair"
-        figures.draw_matches(snapshot, title, folder / "matches.png")
+        rival = _rival(folder, record, snapshot)
+        figures.draw_matches(snapshot, title, folder / "matches.png", rival)
+
+
+def _rival(folder: Path, record: Record, snapshot: PairSnapshot) -> figures.RivalResult | None:
+    """Find where METHOD puts the source of a snapshot of METHOD_corr."""
+    with (folder / "per_pair.csv").open(newline="") as file:
+        for row in csv.DictReader(file):
+            if row["arm"] == record.baseline and int(row["shape"]) == snapshot.shape:
+                values = [float(number) for number in row["transform"].split()]
+                rotation = [values[start : start + 3] for start in (0, 3, 6)]
+                error = float(row["rotation_error_deg"])
+                return figures.RivalResult(row["arm"], rotation, values[9:], error)
+    return None
 
 
 def null_for_nan(value: object) -> object:
