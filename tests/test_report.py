@@ -5,7 +5,7 @@ import pytest
 from conftest import ROOT
 
 from corrmat.errors import CorrmatError
-from corrmat.reporting import documents, figures, tables
+from corrmat.reporting import documents, figures, overview, tables
 from corrmat.reporting.record import Record
 
 RECORD = {
@@ -157,3 +157,16 @@ def test_every_place_that_the_map_of_the_paper_names_is_there():
         for target in re.findall(r"`make ([\w.]+)`", row):
             assert target in (ROOT / "Makefile").read_text()
     assert named > 25
+
+
+def test_the_overview_has_a_panel_for_the_longest_training_of_each_experiment(monkeypatch):
+    records = documents.documented_records(ROOT / "results")
+    chosen = overview.longest_records(records)
+    assert [record.id for record in chosen] == sorted({record.id for record in records})
+    longest = {record.id: record.scale for record in chosen}
+    assert longest["1.2"] == "overnight"
+    drawn = []
+    monkeypatch.setattr(overview, "_draw_panel", lambda axes, record: drawn.append(record.id))
+    assert overview.draw_overview(chosen).startswith(b"\x89PNG")
+    assert drawn == [record.id for record in chosen]
+    assert overview._curve_points(records[0].arms["DCP"])[0][-1] >= 8000

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from corrmat.errors import CorrmatError
-from corrmat.files import replace_text
+from corrmat.files import replace_bytes, replace_text
 from corrmat.reporting.claims import headline, markdown_claims, read_evidence
 from corrmat.reporting.comparisons import (
     comparison_summary,
@@ -13,12 +13,12 @@ from corrmat.reporting.comparisons import (
     confidence_table,
     networks_table,
 )
+from corrmat.reporting.overview import draw_overview, longest_records
 from corrmat.reporting.record import Record, read_records
 from corrmat.reporting.tables import markdown_row, markdown_summary, markdown_tables
 from corrmat.reporting.writer import draw_record
 
 HEADLINES = ("1.2", "1.3", "2.1", "2.2", "3.2", "outliers")  # experiments of README's table
-_SCALE_ORDER = {"laptop": 0, "overnight": 1, "paper": 2}
 
 
 def claims_table(results: Path) -> str:
@@ -39,12 +39,9 @@ def headline_table(results: Path) -> str:
         "verdict",
     ]
     lines = [markdown_row(heads), "|" + "---|" * len(heads)]
-    records = documented_records(results)
-    for identity in HEADLINES:
-        candidates = [record for record in records if record.id == identity]
-        if candidates:
-            best = max(candidates, key=lambda r: (_SCALE_ORDER[r.scale], r.data == "shapes"))
-            lines.append(markdown_row(headline(read_evidence(best, results))))
+    for record in longest_records(documented_records(results)):
+        if record.id in HEADLINES:
+            lines.append(markdown_row(headline(read_evidence(record, results))))
     return "\n".join(lines)
 
 
@@ -143,6 +140,8 @@ def rewrite_documents(results: Path, root: Path) -> int:
     records = documented_records(results)
     for record in records:
         draw_record(results / record.place)
+    overview = draw_overview(longest_records(records))
+    replace_bytes(root / "docs" / "overview.png", overview)
     for page, mark, content in TABLES:
         replace_between_marks(root / page, mark, content(records, results))
     return len(records)

@@ -1,5 +1,6 @@
 """All records as one HTML page that needs no server and no network."""
 
+import base64
 import itertools
 import json
 from dataclasses import dataclass, field
@@ -10,6 +11,7 @@ from plotly.offline import get_plotlyjs
 
 from corrmat.reporting import plots
 from corrmat.reporting.claims import claims_of
+from corrmat.reporting.overview import draw_overview, longest_records
 from corrmat.reporting.provenance import command, staleness
 from corrmat.reporting.record import Record, read_records, read_snapshots
 from corrmat.reporting.tables import METRICS, cell, effort, paper_metric, ratio, table
@@ -56,6 +58,7 @@ def build_page(results: Path) -> str:
         HTML with everything in it.
     """
     records = sorted(read_records(results), key=lambda r: (r.id, r.scale, r.data, r.seed))
+    shown = [record for record in records if record.scale != "smoke" and record.seed == 0]
     figures: dict[str, plots.Plot] = {}
     sections = []
     for identity, group in itertools.groupby(records, key=lambda r: r.id):
@@ -65,6 +68,7 @@ def build_page(results: Path) -> str:
         sections.append(Section(identity, title, articles))
     return _ENVIRONMENT.get_template("records.html.j2").render(
         claims=claims_of(records, results),
+        overview=base64.b64encode(draw_overview(longest_records(shown))).decode() if shown else "",
         summary=[row for record in records for row in _summary_rows(record)],
         sections=sections,
         robustness=_robustness(results, figures),
