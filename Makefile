@@ -16,7 +16,7 @@ OPTIONS = --scale $(SCALE) --data.data $(DATA) $(if $(ROOT),--data.root "$(ROOT)
 # What a cluster has trained anew is not trained a second time to be tested.
 RUN_OPTIONS = $(OPTIONS) $(if $(filter ray,$(LAUNCHER)),$(filter-out --fresh,$(ARGS)),$(ARGS))
 
-.PHONY: help $(EXPERIMENTS) outliers robustness all on-ray rates weights checkpoints protocols docs report bench lint format test test-slow test-oldest lock clean
+.PHONY: help $(EXPERIMENTS) outliers robustness all on-ray rates weights checkpoints protocols docs docs-site report bench lint format test test-slow test-oldest lock clean
 
 help:  ## list the targets
 	@echo "make TARGET [SCALE=smoke|laptop|overnight|paper] [DATA=shapes|modelnet40|folder] [ROOT=folder] [NAME=chairs] [ARGS='--key value']"
@@ -54,20 +54,27 @@ docs: .venv/ready  ## rewrite the documents' tables, redraw the pictures of docs
 	$(BIN)/corrmat example runs/example > /dev/null
 	$(BIN)/corrmat register runs/example/source.ply runs/example/target.ply --gif docs/register.gif
 
+docs-site: .venv/ready  ## README and docs/ as a site in build/site; a broken link is an error
+	rm -rf build/site-source && mkdir -p build/site-source
+	cp --parents *.md CITATION.cff docs/* notebooks/* src/corrmat/shipped/MODEL_CARD.md \
+		$$(grep -oh 'results/[^)]*' docs/*.md | grep -E '\.(png|json)$$' | sort -u) build/site-source
+	mv build/site-source/README.md build/site-source/index.md
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
 report: .venv/ready  ## report.html: every record on one page
 	$(BIN)/corrmat report -o report.html
 
 bench: .venv/ready  ## speed: pairs a second, training steps, ratios against a naive twin
 	$(BIN)/python benchmarks/bench.py
 
-lint: .venv/ready  ## ruff, pyright, codespell, and the layers that imports keep to
+lint: .venv/ready docs-site  ## ruff, pyright, codespell, and the layers that imports keep to
 	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/pyright && $(BIN)/lint-imports && $(BIN)/codespell
 
 format: .venv/ready  ## let ruff rewrite what it can
 	$(BIN)/ruff check --fix . && $(BIN)/ruff format .
 
 test: .venv/ready  ## everything but the slow learning tests, smoke training of every experiment included
-	$(BIN)/pytest
+	$(BIN)/pytest --nbmake tests notebooks
 
 test-slow: .venv/ready  ## learning, kill -9 at any moment, SLURM, Ray, all checksums
 	$(BIN)/pytest -m slow

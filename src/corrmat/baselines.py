@@ -156,7 +156,7 @@ class KissSettings(NamedTuple):
     voxel_size: float
 
 
-KISS = KissSettings(voxel_size=0.13)
+KISS = KissSettings(voxel_size=0.17)
 
 
 def kiss_matcher(
