@@ -6,6 +6,7 @@ in units in which a cloud's radius is about one.
 
 import contextlib
 import importlib
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -61,7 +62,7 @@ class Ransac(nn.Module):
         """Register source (B, N, 6) to target (B, M, 6), xyz and unit normal; no correspondence."""
         clouds = zip(source.double().cpu().numpy(), target.double().cpu().numpy(), strict=True)
         with _one_thread():
-            found = np.stack([fpfh_ransac(x, y, self.SEED, refine=True) for x, y in clouds])
+            found = np.concatenate([fpfh_ransac(x, y, [self.SEED], refine=True) for x, y in clouds])
         # Open3D's last bits depend on where its arrays lie in memory.
         transform = torch.from_numpy(found.round(8)).to(source)
         return Prediction(transform[:, :3, :3], transform[:, :3, 3])
@@ -92,7 +93,7 @@ FPFH_FGR = FpfhSettings(feature_radius=0.65, inlier_threshold=0.05)
 def fpfh_ransac(
     source: np.ndarray,
     target: np.ndarray,
-    seed: int,
+    seeds: Sequence[int],
     settings: FpfhSettings = FPFH_RANSAC,
     *,
     refine: bool = False,
@@ -102,38 +103,41 @@ def fpfh_ransac(
     Args:
         source: (N, 6), xyz and unit normal.
         target: (M, 6).
-        seed: of the draws.
+        seeds: of the draws; one run each.
         settings: lengths and counts.
         refine: run point-to-point ICP after it.
 
     Returns:
-        The transform (4, 4) of source onto target.
+        The transforms (T, 4, 4) of source onto target, one a seed.
 
     Raises:
         CorrmatError: Open3D cannot be imported.
     """
     o3d, clouds, features = _fpfh(source, target, settings)
     registration = o3d.pipelines.registration
-    o3d.utility.random.seed(seed)
     point_to_point = registration.TransformationEstimationPointToPoint(False)
-    result = registration.registration_ransac_based_on_feature_matching(
-        *clouds,
-        *features,
-        settings.mutual,
-        settings.inlier_threshold,
-        point_to_point,
-        3,
-        [
-            registration.CorrespondenceCheckerBasedOnEdgeLength(0.9),
-            registration.CorrespondenceCheckerBasedOnDistance(settings.inlier_threshold),
-        ],
-        registration.RANSACConvergenceCriteria(settings.iterations, 0.999),
-    )
-    if refine:
-        result = registration.registration_icp(
-            *clouds, settings.inlier_threshold, result.transformation, point_to_point
+    transforms = []
+    for seed in seeds:
+        o3d.utility.random.seed(seed)
+        result = registration.registration_ransac_based_on_feature_matching(
+            *clouds,
+            *features,
+            settings.mutual,
+            settings.inlier_threshold,
+            point_to_point,
+            3,
+            [
+                registration.CorrespondenceCheckerBasedOnEdgeLength(0.9),
+                registration.CorrespondenceCheckerBasedOnDistance(settings.inlier_threshold),
+            ],
+            registration.RANSACConvergenceCriteria(settings.iterations, 0.999),
         )
-    return np.array(result.transformation)
+        if refine:
+            result = registration.registration_icp(
+                *clouds, settings.inlier_threshold, result.transformation, point_to_point
+            )
+        transforms.append(np.array(result.transformation))
+    return np.stack(transforms)
 
 
 def fpfh_fgr(

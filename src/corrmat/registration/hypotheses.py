@@ -129,7 +129,7 @@ def ransac(
     source: np.ndarray, target: np.ndarray, seed: int, settings: FpfhSettings = FPFH_RANSAC
 ) -> Hypotheses:
     """Return the one hypothesis of RANSAC over FPFH features."""
-    return Hypotheses(fpfh_ransac(source, target, seed, settings)[None], *_NO_MATCHES)
+    return Hypotheses(fpfh_ransac(source, target, [seed], settings), *_NO_MATCHES)
 
 
 def fgr(
@@ -151,8 +151,7 @@ def ransac17(
 ) -> Hypotheses:
     """Return as many hypotheses of RANSAC as the network has: one from each of seventeen seeds."""
     seeds = range(17 * seed, 17 * (seed + 1))
-    found = [fpfh_ransac(source, target, each, settings) for each in seeds]
-    return Hypotheses(np.stack(found), *_NO_MATCHES)
+    return Hypotheses(fpfh_ransac(source, target, seeds, settings), *_NO_MATCHES)
 
 
 CLASSICAL: dict[str, HypothesisGenerator] = {
