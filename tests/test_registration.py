@@ -316,6 +316,7 @@ def test_the_page_opens_in_a_browser(pair, tmp_path):
     words = ["--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=8000"]
     words += ["--enable-logging=stderr", "--dump-dom", path.as_uri()]
     shown = subprocess.run([BROWSER, *words], capture_output=True, text=True, timeout=120)
-    assert "before, and the matches" in shown.stdout
+    assert 'aria-label="from before to after"' in shown.stdout
+    assert "aligned, confidence" in shown.stdout
     assert not [line for line in shown.stderr.splitlines() if "Uncaught" in line]
     assert 'class="gl-container"' in shown.stdout

@@ -1,14 +1,22 @@
-"""The registration page: before, matches and after, without a server or a network."""
+"""The registration page: the source moves onto the target under a slider; no server, no network."""
 
+import json
+
+import jinja2
 import numpy as np
 import plotly.graph_objects as go
-from plotly.subplots import make_subplots
+from scipy.spatial.transform import Rotation
 
 from corrmat.registration.register import Registration
-from corrmat.reporting.figures import BLUE, RED, thin
+from corrmat.reporting.figures import BLUE, GREEN, GREY, RED, thin
 
 MAX_POINTS = 4000  # drawn of a cloud
 MAX_LINES = 150  # strongest matches drawn
+_ENVIRONMENT = jinja2.Environment(
+    loader=jinja2.PackageLoader("corrmat.reporting"),
+    autoescape=True,
+    undefined=jinja2.StrictUndefined,
+)
 
 
 def registration_page(registration: Registration, source: np.ndarray, target: np.ndarray) -> str:
@@ -22,85 +30,61 @@ def registration_page(registration: Registration, source: np.ndarray, target: np
     # Far from the origin a browser's float32 would lose the detail.
     origin = target[:, :3].mean(0)
     rotation, translation = registration.transform[:3, :3], registration.transform[:3, 3]
-    moved = source[:, :3] @ rotation.T + translation - origin
-    shifted = source[:, :3] - source[:, :3].mean(0)
+    aligned = source[:, :3] @ rotation.T + translation - origin
     fixed = target[:, :3] - origin
-    gap = np.array([1.1 * (np.ptp(fixed[:, 0]) + np.ptp(shifted[:, 0])), 0, 0]) / 2
-    figure = make_subplots(
-        rows=1,
-        cols=2,
-        specs=[[{"type": "scene"}] * 2],
-        subplot_titles=("before, and the matches", "after"),
-        horizontal_spacing=0.02,
-    )
-    for column, (x, y) in enumerate(((shifted - gap, fixed + gap), (moved, fixed)), 1):
-        for name, cloud, colour in (("source", x, RED), ("target", y, BLUE)):
-            figure.add_trace(_points(cloud, name, colour, column == 1), row=1, col=column)
-    if len(registration.matches):
-        figure.add_trace(_matches(registration, shifted - gap, fixed + gap), row=1, col=1)
-    hidden = {"visible": False}
-    scene = {"xaxis": hidden, "yaxis": hidden, "zaxis": hidden, "aspectmode": "data"}
+    strongest = np.argsort(-registration.match_confidence, kind="stable")[:MAX_LINES]
+    i, j = registration.matches[strongest].T
+    agrees = registration.match_agrees[strongest]
+    figure = go.Figure([_points(fixed, "target", BLUE), _points(aligned, "source", RED)])
+    for name, chosen, colour in (
+        ("matches that agree", agrees, GREEN),
+        ("other matches", ~agrees, GREY),
+    ):
+        figure.add_trace(_lines(aligned[i[chosen]], fixed[j[chosen]], name, colour))
+    middle = aligned.mean(0)
+    beside = 0.6 * float(np.ptp(fixed, axis=0).max() + np.ptp(aligned, axis=0).max())
+    before = (aligned - middle) @ rotation + middle - [beside, 0, 0]
+    everything = np.vstack([fixed, aligned, before])
+    axes = {
+        f"{axis}axis": {"visible": False, "range": [low, high]}  # the same all along the way
+        for axis, low, high in zip("xyz", everything.min(0), everything.max(0), strict=True)
+    }
     figure.update_layout(
-        title=_title(registration),
-        template="plotly_white",
-        margin={"l": 8, "r": 8, "t": 96, "b": 8},
-        legend={"orientation": "h", "y": 0},
-        scene=scene,
-        scene2=scene,
+        template="none",
+        paper_bgcolor="rgba(0,0,0,0)",
+        margin={"l": 0, "r": 0, "t": 0, "b": 0},
+        legend={"orientation": "h", "y": 0, "font": {"color": "#808080"}},
+        scene={**axes, "aspectmode": "data", "camera": {"eye": {"x": 0.3, "y": -1.4, "z": 0.7}}},
     )
-    return figure.to_html(include_plotlyjs=True, full_html=True, default_height="96vh")
+    motion = {
+        "middle": middle.tolist(),
+        "turn": Rotation.from_matrix(rotation.T).as_rotvec().tolist(),
+        "beside": beside,
+    }
+    return _ENVIRONMENT.get_template("registration.html.j2").render(
+        registration=registration,
+        motion=json.dumps(motion),
+        plot=figure.to_html(
+            include_plotlyjs=True,
+            full_html=False,
+            default_height="78vh",
+            div_id="clouds",
+            config={"displayModeBar": False},
+        ),
+    )
 
 
-def _points(cloud: np.ndarray, name: str, colour: str, legend: bool) -> go.Scatter3d:
+def _points(cloud: np.ndarray, name: str, colour: str) -> go.Scatter3d:
     """Build the trace of a cloud (N, 3), thinned evenly."""
-    x, y, z = thin(cloud, MAX_POINTS).astype(np.float32).T
-    return go.Scatter3d(
-        x=x,
-        y=y,
-        z=z,
-        name=name,
-        mode="markers",
-        marker={"size": 2, "color": colour},
-        legendgroup=name,
-        showlegend=legend,
-        hoverinfo="skip",
-    )
+    x, y, z = thin(cloud, MAX_POINTS).astype(np.float32).T.tolist()
+    marker = {"size": 2, "color": colour}
+    return go.Scatter3d(x=x, y=y, z=z, name=name, mode="markers", marker=marker, hoverinfo="skip")
 
 
-def _matches(registration: Registration, source: np.ndarray, target: np.ndarray) -> go.Scatter3d:
-    """Build the trace of the strongest matches, coloured by confidence."""
-    order = np.argsort(-registration.match_confidence, kind="stable")[:MAX_LINES]
-    ends = np.full((len(order), 3, 3), np.nan)  # from, to, and a gap before the next
-    ends[:, 0], ends[:, 1] = (
-        source[registration.matches[order, 0]],
-        target[registration.matches[order, 1]],
-    )
-    x, y, z = ends.reshape(-1, 3).astype(np.float32).T
-    confidence = np.repeat(registration.match_confidence[order], 3)
-    return go.Scatter3d(
-        x=x,
-        y=y,
-        z=z,
-        name="matches",
-        mode="lines",
-        line={
-            "width": 2,
-            "color": confidence,
-            "colorscale": "Viridis",
-            "cmin": 0,
-            "cmax": float(registration.match_confidence.max()),
-            "colorbar": {"title": "confidence", "thickness": 12, "len": 0.6},
-        },
-        hoverinfo="skip",
-    )
-
-
-def _title(registration: Registration) -> str:
-    """Format verdict, confidence and errors for the heading."""
-    return (
-        f"{registration.verdict} (confidence {registration.confidence:.0%}): rotated by "
-        f"{registration.rotation_deg:.2f}°, RMSE {registration.rmse:.4g}, "
-        f"{registration.overlap:.0%} of the source on the target<br>"
-        f"<sup>corrmat register, model {registration.model}, seed {registration.seed}. "
-        "Drag to rotate, scroll to zoom.</sup>"
-    )
+def _lines(start: np.ndarray, end: np.ndarray, name: str, colour: str) -> go.Scatter3d:
+    """Build the trace of lines from (K, 3) source points to (K, 3) target points."""
+    ends = np.full((len(start), 3, 3), np.nan)  # from, to, and a gap before the next
+    ends[:, 0], ends[:, 1] = start, end
+    x, y, z = ends.reshape(-1, 3).astype(np.float32).T.tolist()
+    line = {"width": 2, "color": colour}
+    return go.Scatter3d(x=x, y=y, z=z, name=name, mode="lines", line=line, hoverinfo="skip")
