@@ -71,6 +71,7 @@ def ship_arms() -> None:
         options = parse(["run", *sys.argv[1:]])
         from corrmat.training import recipe, shipping
 
+        _prepare_output(options)
         paths = [options.config] if options.config else sorted(_config_folder().glob("*.yaml"))
         for path in paths:
             loaded = recipe.load(path, options.scale, options.overrides)

@@ -5,14 +5,16 @@ from pathlib import Path
 from corrmat import weights
 from corrmat.reporting.record import read_record
 from corrmat.training.preflight import prepare
-from corrmat.training.recipe import Recipe
+from corrmat.training.recipe import SCALES, Recipe
 from corrmat.training.runs import best_checkpoint
 
 MAX_PARAMETERS = 2_000_000  # PCRNet's pose network, of 17 MB, is left out
 
 
 def ship(recipe: Recipe, results: Path, runs_folder: Path) -> list[str]:
-    """Write the weights that an experiment's record was tested with into the package.
+    """Write the weights of METHOD and METHOD_corr that a record was tested with into the package.
+
+    Weights of a larger scale that ship already are kept.
 
     Args:
         recipe: the experiment.
@@ -26,14 +28,17 @@ def ship(recipe: Recipe, results: Path, runs_folder: Path) -> list[str]:
     if recipe.networks_of or not path.is_file():
         return []
     shipped = []
-    for name, settings in recipe.arms.items():
+    for name in filter(None, (recipe.baseline, recipe.treatment)):
+        settings = recipe.arms[name]
+        model = f"{recipe.id}/{name}"
+        if model in weights.shipped_models() and _shipped_scale(model) > SCALES.index(recipe.scale):
+            continue
         checkpoint = best_checkpoint(recipe, prepare(settings), runs_folder)
         if not checkpoint.is_file():
             continue
         _, hparams, network = weights.checkpoint_network(checkpoint)
         if sum(p.numel() for p in network.parameters()) > MAX_PARAMETERS:
             continue
-        model = f"{recipe.id}/{name}"
         trained_at = str(read_record(path).arms[name].trained_at)
         weights.ship_network(
             model, settings.method, hparams, network,
@@ -41,3 +46,8 @@ def ship(recipe: Recipe, results: Path, runs_folder: Path) -> list[str]:
         )  # fmt: skip
         shipped.append(model)
     return shipped
+
+
+def _shipped_scale(model: str) -> int:
+    """Return the place in `SCALES` of the record of weights that ship."""
+    return SCALES.index(Path(weights.shipped_metadata(model)["record"]).parts[0])
