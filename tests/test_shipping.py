@@ -18,6 +18,8 @@ def checkpoint(tmp_path):
     content = {"state_dict": method.state_dict(), "hyper_parameters": dict(method.hparams)}
     method.on_save_checkpoint(content)
     torch.save(content, tmp_path / "last.ckpt")
+    trained = {"pairs_seen": 400, "train_seconds": 2.0, "commit": "abc", "curve": [{"loss": 1.0}]}
+    (tmp_path / "trained.json").write_text(json.dumps(trained))
     return tmp_path / "last.ckpt"
 
 
@@ -28,17 +30,22 @@ def package(tmp_path, monkeypatch):
     copy.parent.mkdir()
     shutil.copy(weights.SHIPPED, copy)
     monkeypatch.setattr(weights, "SHIPPED", copy)
-    monkeypatch.setattr(shipping, "CALIBRATION_PAIRS", 8)
+    monkeypatch.setattr(shipping, "CALIBRATION_PAIRS", 9)
     monkeypatch.setattr("corrmat.data.shapes.dataset.SIZE", {"train": 200, "test": 10})
     return copy
 
 
-def test_a_checkpoint_becomes_the_weights_of_the_package(checkpoint, package, capsys):
-    shipping.ship(checkpoint)
+def test_a_checkpoint_becomes_the_weights_of_the_package(checkpoint, package, tmp_path, capsys):
+    before = int(weights.shipped_metadata()["pairs"])
+    shipping.ship(checkpoint, tmp_path / "results")
     assert package.name in capsys.readouterr().out
     header = weights.shipped_metadata()
     assert header["method"] == "Invariant_corr"
     assert json.loads(header["network"]) == NETWORK
+    assert int(header["pairs"]) == before + 400
+    (run,) = json.loads((tmp_path / "results" / "register" / "training.json").read_text())
+    assert (run["before"], run["pairs"], run["curve"]) == (before, before + 400, [{"loss": 1.0}])
+    assert set(run["validation"]) == {"real", "views", "clean"}
     calibration = weights.shipped_calibration()
     assert (len(calibration.both), len(calibration.agreement)) == (3, 2)
     assert 0 < calibration.confidence(0.5, 0.5) < 1
@@ -55,7 +62,7 @@ def test_nothing_is_shipped_before_its_calibration_is_done(checkpoint, package, 
 
     monkeypatch.setattr(shipping, "calibrate", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        shipping.ship(checkpoint)
+        shipping.ship(checkpoint, package.parent / "results")
     assert package.read_bytes() == before
     assert [path.name for path in package.parent.iterdir()] == [package.name]
 

@@ -95,7 +95,8 @@ def train_weights(recipe: Path) -> None:
 
         experiment = load(recipe, options.scale, options.overrides)
         if (experiment.scale, experiment.data) == ("laptop", "shapes+assemblies"):
-            ship(options.runs / experiment.place / experiment.treatment / "last.ckpt")
+            run = options.runs / experiment.place / experiment.treatment
+            ship(run / "last.ckpt", recipe.parents[1] / "results")
     sys.exit(code)
 
 

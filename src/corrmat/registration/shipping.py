@@ -7,50 +7,70 @@ import numpy as np
 from scipy.optimize import minimize
 
 from corrmat import weights
+from corrmat.files import replace_text
 from corrmat.metrics import ADDS_THRESHOLD
 from corrmat.registration import benchmark
 from corrmat.reporting.provenance import commit
+from corrmat.training.runs import trained_facts
 
 CALIBRATION_PAIRS = 300
+_PROTOCOLS: tuple[benchmark.Protocol, ...] = ("real", "views", "clean")
 
 
-def ship(checkpoint: Path) -> None:
+def ship(checkpoint: Path, results: Path) -> None:
     """Calibrate the confidence of a checkpoint and write its weights into the package.
 
-    Nothing is written before the calibration is done.
+    Nothing is written before the calibration is done. Training goes on from the weights that ship,
+    so that the pairs of every run are added up; results/register/training.json has its curve.
 
     Args:
-        checkpoint: of `corrmat fit`.
+        checkpoint: of `corrmat fit`, in the folder of its run.
+        results: folder of records.
     """
     _, hparams, network = weights.checkpoint_network(checkpoint)
-    calibration = calibrate(checkpoint)
+    calibration, recalls = calibrate(str(checkpoint))
+    facts = trained_facts(checkpoint.parent)
+    before = int(weights.shipped_metadata().get("pairs", 0))
+    pairs = before + facts["pairs_seen"]
     path = weights.ship_network(
         "corrmat", "Invariant_corr", hparams, network,
-        commit=str(commit()), calibration=json.dumps(calibration),
+        commit=str(commit()), calibration=json.dumps(calibration), pairs=str(pairs),
     )  # fmt: skip
-    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
+    add_training(results, {"before": before, "pairs": pairs, **facts, "validation": recalls})
+    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, trained on {pairs:,} pairs")
 
 
-def calibrate(checkpoint: Path) -> dict[str, list[float]]:
+def add_training(results: Path, run: dict[str, object]) -> None:
+    """Add a training run to results/register/training.json."""
+    path = results / "register" / "training.json"
+    runs = json.loads(path.read_text()) if path.is_file() else []
+    path.parent.mkdir(parents=True, exist_ok=True)
+    replace_text(path, json.dumps([*runs, run], indent=1) + "\n")
+
+
+def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:
     """Fit the chance that a pair is aligned to its agreement and support.
 
-    Logistic regression on validation pairs of two difficulties; `weights.Calibration` applies it.
+    Logistic regression on validation pairs of three difficulties; `weights.Calibration` applies it.
 
     Args:
-        checkpoint: of the model.
+        model: as `register` takes it.
 
     Returns:
-        Coefficients over (agreement, support, 1) and over (agreement, 1).
+        Coefficients over (agreement, support, 1) and over (agreement, 1); and the share of the
+        pairs of each protocol that are within 5 degrees.
     """
-    scores, aligned = [], []
-    for protocol in ("real", "clean"):
-        pairs = benchmark.frozen_pairs(protocol, count=CALIBRATION_PAIRS // 2, split="val")
-        result = benchmark.compare(pairs, [str(checkpoint)])[str(checkpoint)].per_pair
-        scores += zip(result["agreement"], result["support"], strict=True)
-        aligned += [distance < ADDS_THRESHOLD for distance in result["adds"]]
+    scores, aligned, recalls = [], [], {}
+    for protocol in _PROTOCOLS:
+        count = CALIBRATION_PAIRS // len(_PROTOCOLS)
+        pairs = benchmark.frozen_pairs(protocol, count=count, split="val")
+        result = benchmark.compare(pairs, [model])[model]
+        recalls[protocol] = result.recall_5deg
+        scores += zip(result.per_pair["agreement"], result.per_pair["support"], strict=True)
+        aligned += [distance < ADDS_THRESHOLD for distance in result.per_pair["adds"]]
     x = np.column_stack([np.array(scores), np.ones(len(scores))])
     y = np.array(aligned, float)
-    return {"both": _fit_logistic(x, y), "agreement": _fit_logistic(x[:, [0, 2]], y)}
+    return {"both": _fit_logistic(x, y), "agreement": _fit_logistic(x[:, [0, 2]], y)}, recalls
 
 
 def _fit_logistic(x: np.ndarray, y: np.ndarray) -> list[float]:

@@ -5,7 +5,7 @@ import logging
 import pickle
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import torch
 import yaml
@@ -61,6 +61,12 @@ def finish_run(folder: Path, trained: TrainedArm) -> None:
     """Note that an arm is trained."""
     content = asdict(trained) | {"checkpoint": trained.checkpoint.name}
     replace_text(folder / _TRAINED, json.dumps(content, indent=1))
+
+
+def trained_facts(folder: Path) -> dict[str, Any]:
+    """Return what a finished run says of itself: pairs_seen, train_seconds, commit and curve."""
+    content = json.loads((folder / _TRAINED).read_text())
+    return {name: content[name] for name in ("pairs_seen", "train_seconds", "commit", "curve")}
 
 
 def mark_recorded(folder: Path) -> None:
