@@ -10,7 +10,7 @@ import torch
 from corrmat.cli import main
 from corrmat.data import registry
 from corrmat.errors import CorrmatError
-from corrmat.registration import benchmark
+from corrmat.registration import benchmark, shipping
 from corrmat.reporting import comparisons
 
 
@@ -96,3 +96,14 @@ def test_what_cannot_be_compared_is_said(pairs):
     with pytest.raises(CorrmatError, match="needs its folder"):
         benchmark.frozen_pairs("real", data="modelnet40")
     assert main(["compare", "nobody", "--points", "64", "--pairs", "1"]) == 2
+
+
+def test_the_training_of_the_shipped_weights_is_drawn(tmp_path):
+    comparisons.draw_training(tmp_path)
+    recalls = {"real": 0.5, "views": 0.7, "clean": 0.9}
+    points = [{"pairs_seen": 100 * i, "loss": 9.0 - i} for i in range(1, 4)]
+    for before in (0, 300):
+        run = {"before": before, "pairs": before + 300, "curve": points, "validation": recalls}
+        shipping.add_training(tmp_path, run)
+    comparisons.draw_training(tmp_path)
+    assert (tmp_path / "register" / "training.png").stat().st_size > 10_000

@@ -5,9 +5,12 @@ import json
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 from scipy import stats
 
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG
+from corrmat.reporting.figures import BLUE, GREEN, RED, save
 from corrmat.reporting.tables import markdown_row
 from corrmat.weights import shipped_calibration
 
@@ -110,6 +113,34 @@ def expected_calibration_error(promised: np.ndarray, happened: np.ndarray) -> fl
     bins = np.minimum((promised * _BINS).astype(int), _BINS - 1)
     gaps = [abs((promised - happened)[bins == b].sum()) for b in range(_BINS)]
     return float(sum(gaps) / len(promised))
+
+
+def draw_training(results: Path) -> None:
+    """Draw how the shipped weights were trained: loss, and recall on validation pairs.
+
+    Nothing is drawn where results/register/training.json is missing.
+    """
+    path = results / "register" / "training.json"
+    if not path.is_file():
+        return
+    runs = json.loads(path.read_text())
+    figure = Figure(figsize=(8.2, 3), layout="constrained")
+    loss, recall = figure.subplots(1, 2)
+    for run in runs:
+        x = [run["before"] + point["pairs_seen"] for point in run["curve"]]
+        loss.plot(x, [point["loss"] for point in run["curve"]], color=BLUE)
+    for protocol, colour in zip(_PROTOCOLS, (RED, GREEN, BLUE), strict=True):
+        y = [100 * run["validation"][protocol] for run in runs]
+        recall.plot([run["pairs"] for run in runs], y, "o-", color=colour, label=protocol)
+    loss.set(title="training loss", xlabel="pairs seen")
+    recall.set(title="within 5 degrees, validation, %", xlabel="pairs seen", xscale="log")
+    recall.xaxis.set_minor_formatter(EngFormatter(sep=""))
+    recall.tick_params(axis="x", which="minor", labelsize="x-small")
+    recall.legend()
+    for axes in (loss, recall):
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.grid(alpha=0.3)
+    save(figure, path.with_suffix(".png"))
 
 
 def _read_comparisons(results: Path) -> list[dict]:

@@ -11,6 +11,7 @@ from corrmat.reporting.comparisons import (
     comparison_summary,
     comparison_table,
     confidence_table,
+    draw_training,
     networks_table,
 )
 from corrmat.reporting.overview import draw_overview, longest_records
@@ -140,6 +141,7 @@ def rewrite_documents(results: Path, root: Path) -> int:
     records = documented_records(results)
     for record in records:
         draw_record(results / record.place)
+    draw_training(results)
     overview = draw_overview(longest_records(records))
     replace_bytes(root / "docs" / "overview.png", overview)
     for page, mark, content in TABLES:
