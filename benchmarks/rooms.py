@@ -1,0 +1,103 @@
+"""Fragments of rooms: the shipped weights beside pipelines made for rooms, at their own settings.
+
+    python benchmarks/rooms.py        minutes; needs pip install -e '.[baselines]'
+
+FPFH + RANSAC (Open3D) and KISS-Matcher get the whole clouds on a voxel grid. Its size is chosen on
+other rooms. All are refined by the same generalised ICP on all points. The record is
+results/register/rooms-procedural-20000.json.
+"""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import kiss_matcher
+import numpy as np
+import open3d as o3d
+from rich.progress import track
+
+from corrmat.registration import benchmark
+from corrmat.registration.scoring import AlignmentScorer
+from corrmat.types import PairBatch
+
+RESULTS = Path(__file__).resolve().parents[1] / "results" / "register"
+POINTS, TEST_ROOMS, TUNING_ROOMS = 20_000, 60, 20
+VOXELS_M = {"ransac": (0.05, 0.08, 0.12, 0.18), "kiss": (0.06, 0.1, 0.15, 0.22, 0.3)}
+
+
+def ransac(source: np.ndarray, target: np.ndarray, voxel: float) -> np.ndarray:
+    """Run RANSAC over FPFH features of voxelised clouds, with Open3D's customary ratios."""
+    clouds, features = [], []
+    for points in (source, target):
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+        cloud = cloud.voxel_down_sample(voxel)
+        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(2 * voxel, 30))
+        search = o3d.geometry.KDTreeSearchParamHybrid(5 * voxel, 100)
+        clouds.append(cloud)
+        features.append(o3d.pipelines.registration.compute_fpfh_feature(cloud, search))
+    o3d.utility.random.seed(0)
+    registration = o3d.pipelines.registration
+    result = registration.registration_ransac_based_on_feature_matching(
+        *clouds,
+        *features,
+        True,
+        1.5 * voxel,
+        registration.TransformationEstimationPointToPoint(False),
+        3,
+        [
+            registration.CorrespondenceCheckerBasedOnEdgeLength(0.9),
+            registration.CorrespondenceCheckerBasedOnDistance(1.5 * voxel),
+        ],
+        registration.RANSACConvergenceCriteria(400_000, 0.999),
+    )
+    return np.array(result.transformation)
+
+
+def kiss(source: np.ndarray, target: np.ndarray, voxel: float) -> np.ndarray:
+    """Run KISS-Matcher with its defaults."""
+    clouds = (list(points.astype(np.float32)) for points in (source, target))
+    solution = kiss_matcher.KISSMatcher(voxel).estimate(*clouds)
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = solution.rotation, np.ravel(solution.translation)
+    return transform
+
+
+PIPELINES: dict[str, Callable[[np.ndarray, np.ndarray, float], np.ndarray]] = {
+    "ransac": ransac, "kiss": kiss,
+}  # fmt: skip
+
+
+def run(pairs: PairBatch, name: str, voxel: float) -> benchmark.ModelResult:
+    """Register all pairs with one pipeline, refined on all points."""
+    outcomes = []
+    for index in track(range(len(pairs)), f"{name}, {voxel} m", transient=True):
+        source, target = (c[index].double().numpy() for c in (pairs.source, pairs.target))
+        start = time.perf_counter()
+        scorer = AlignmentScorer(source, target)
+        transform = scorer.refine(PIPELINES[name](source, target, voxel))
+        ms = 1e3 * (time.perf_counter() - start)
+        angle, adds = benchmark.errors(pairs, index, transform)
+        outcomes.append(benchmark.Outcome(angle, adds, ms, scorer.agreement(transform), 1.0))
+    return benchmark.summarise(pairs, outcomes)
+
+
+def main() -> None:
+    """Choose the voxels, then compare."""
+    tuning = benchmark.frozen_pairs("rooms", points=POINTS, count=TUNING_ROOMS, split="val")
+    tried = {
+        name: {voxel: run(tuning, name, voxel).recall_5deg for voxel in voxels}
+        for name, voxels in VOXELS_M.items()
+    }
+    print(tried)
+    pairs = benchmark.frozen_pairs("rooms", points=POINTS, count=TEST_ROOMS)
+    results = benchmark.compare(pairs, ["corrmat"])
+    for name, recalls in tried.items():
+        results[name] = run(pairs, name, max(recalls, key=recalls.__getitem__))
+    print(benchmark.to_table(results))
+    about = {"protocol": "rooms", "data": "procedural", "points": POINTS, "pairs": len(pairs)}
+    path = RESULTS / f"rooms-procedural-{POINTS}.json"
+    benchmark.write_results(path, results, about | {"tuning": tried})
+
+
+if __name__ == "__main__":
+    main()
