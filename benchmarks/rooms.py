@@ -48,7 +48,7 @@ def ransac(source: np.ndarray, target: np.ndarray, voxel: float) -> np.ndarray:
             registration.CorrespondenceCheckerBasedOnEdgeLength(0.9),
             registration.CorrespondenceCheckerBasedOnDistance(1.5 * voxel),
         ],
-        registration.RANSACConvergenceCriteria(400_000, 0.999),
+        registration.RANSACConvergenceCriteria(100_000, 0.999),
     )
     return np.array(result.transformation)
 

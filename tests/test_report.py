@@ -5,7 +5,7 @@ import pytest
 from conftest import ROOT
 
 from corrmat.errors import CorrmatError
-from corrmat.reporting import documents, figures, overview, tables
+from corrmat.reporting import documents, figures, matrices, overview, tables
 from corrmat.reporting.record import Record
 
 RECORD = {
@@ -170,3 +170,10 @@ def test_the_overview_has_a_panel_for_the_longest_training_of_each_experiment(mo
     assert overview.draw_overview(chosen).startswith(b"\x89PNG")
     assert drawn == [record.id for record in chosen]
     assert overview._curve_points(records[0].arms["DCP"])[0][-1] >= 8000
+
+
+def test_the_matrices_of_the_shipped_arms_are_drawn(tmp_path):
+    drawn = matrices.draw_matrices(ROOT / "results")
+    assert drawn is not None
+    assert drawn.startswith(b"\x89PNG")
+    assert matrices.draw_matrices(tmp_path) is None

@@ -14,6 +14,7 @@ from corrmat.reporting.comparisons import (
     draw_training,
     networks_table,
 )
+from corrmat.reporting.matrices import draw_matrices
 from corrmat.reporting.overview import draw_overview, longest_records
 from corrmat.reporting.record import Record, read_records
 from corrmat.reporting.tables import markdown_row, markdown_summary, markdown_tables
@@ -142,6 +143,9 @@ def rewrite_documents(results: Path, root: Path) -> int:
     for record in records:
         draw_record(results / record.place)
     draw_training(results)
+    matrices = draw_matrices(results)
+    if matrices is not None:
+        replace_bytes(root / "docs" / "matrices.png", matrices)
     overview = draw_overview(longest_records(records))
     replace_bytes(root / "docs" / "overview.png", overview)
     for page, mark, content in TABLES:

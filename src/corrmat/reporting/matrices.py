@@ -1,0 +1,52 @@
+"""The correspondence matrices of one pair: what the paper's loss does to a network, at a glance."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+
+from corrmat.reporting.record import read_snapshots
+from corrmat.weights import load_model, shipped_metadata, shipped_models
+
+ARMS = ("1.2/DCP", "1.2/DCP_corr")
+
+
+@torch.no_grad()
+def draw_matrices(results: Path) -> bytes | None:
+    """Draw the matrices of METHOD and METHOD_corr for the median pair of experiment 1.2, as a PNG.
+
+    Rows are source points and columns target points, sorted so that the true matches are the
+    diagonal.
+
+    Args:
+        results: folder of records.
+
+    Returns:
+        None where the weights do not ship, or their record is missing.
+    """
+    if not set(ARMS) <= set(shipped_models()):
+        return None
+    snapshots = read_snapshots(results / shipped_metadata(ARMS[1])["record"])
+    if not snapshots:
+        return None
+    pair = snapshots[len(snapshots) // 2]
+    source, target = (torch.tensor([cloud]) for cloud in (pair.source, pair.target))
+    match = np.asarray(pair.match)
+    rows = np.argsort(match)
+    rest = np.setdiff1d(np.arange(target.shape[1]), match)
+    columns = np.concatenate([match[rows], rest])
+    figure = Figure(figsize=(8.2, 3.3), layout="constrained")
+    for axes, model in zip(figure.subplots(1, 2), ARMS, strict=True):
+        correspondence = load_model(model)(source, target).correspondence
+        prob = correspondence.prob()[0].numpy()[np.ix_(rows, columns)]
+        right = (correspondence.argmax()[0].numpy() == match).mean()
+        axes.imshow(prob, cmap="magma", vmin=0, vmax=prob.max())
+        name = model.split("/")[1]
+        loss = "the correspondence matrix" if name.endswith("_corr") else "the transform"
+        axes.set_title(f"trained on {loss}: {right:.0%} right", fontsize="medium")
+        axes.set(xlabel="target points", ylabel="source points", xticks=[], yticks=[])
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=110, metadata={"Software": None})
+    return content.getvalue()
