@@ -1,6 +1,7 @@
 """Rewrites the tables of README.md and docs/, and redraws their pictures, from results/."""
 
 import json
+from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from corrmat.reporting.comparisons import (
 )
 from corrmat.reporting.matrices import draw_matrices
 from corrmat.reporting.overview import draw_overview, longest_records
-from corrmat.reporting.record import Record, read_records
+from corrmat.reporting.record import Record, defined, read_records
 from corrmat.reporting.tables import markdown_row, markdown_summary, markdown_tables
 from corrmat.reporting.writer import draw_record
 
@@ -60,6 +61,27 @@ def rates_table(results: Path) -> str:
                 cells.append(f"**{cell}**" if rate["lr"] == result["chosen"] else cell)
             pairs = f"{result['rates'][0]['pairs_seen']:,}"
             lines.append(markdown_row([sweep["id"], arm, pairs, *cells]))
+    return "\n".join(lines)
+
+
+def seeds_table(results: Path) -> str:
+    """Build the table of experiments that were trained from several seeds: medians of each."""
+    groups: dict[tuple[str, str, str], dict[int, Record]] = defaultdict(dict)
+    for record in read_records(results):
+        if record.scale != "smoke":
+            groups[record.id, record.scale, record.data][record.seed] = record
+    heads = ["experiment", "arm", "median rotation error by seed, deg", "correct matches, %"]
+    lines = [markdown_row(heads), "|" + "---|" * len(heads)]
+    for (identity, scale, data), by_seed in sorted(groups.items()):
+        if len(by_seed) < 2:
+            continue
+        for arm in by_seed[min(by_seed)].arms:
+            results_of_arm = [by_seed[seed].arms[arm].metrics for seed in sorted(by_seed)]
+            degrees = [f"{m['rotation_error_deg_median']:.3g}" for m in results_of_arm]
+            shares = [defined(m.get("match_accuracy")) for m in results_of_arm]
+            matches = [f"{100 * share:.1f}" for share in shares if share is not None]
+            name = f"{identity}, {scale}, {data}"
+            lines.append(markdown_row([name, arm, ", ".join(degrees), ", ".join(matches)]))
     return "\n".join(lines)
 
 
@@ -112,6 +134,7 @@ TABLES: tuple[tuple[str, str, Callable[[list[Record], Path], str]], ...] = (
     ("README.md", "register", lambda _, results: comparison_summary(results)),
     ("docs/reproduction.md", "results", lambda records, _: markdown_summary(records)),
     ("docs/reproduction.md", "rates", lambda _, results: rates_table(results)),
+    ("docs/reproduction.md", "seeds", lambda _, results: seeds_table(results)),
     ("docs/reproduction.md", "tables", lambda records, _: markdown_tables(records)),
     ("docs/claims.md", "claims", lambda _, results: claims_table(results)),
     ("docs/register.md", "comparison", lambda _, results: comparison_table(results)),
