@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
+from matplotlib.ticker import EngFormatter, NullLocator
 from scipy import stats
 
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG
@@ -134,8 +134,8 @@ def draw_training(results: Path) -> None:
         recall.plot([run["pairs"] for run in runs], y, "o-", color=colour, label=protocol)
     loss.set(title="training loss", xlabel="pairs seen")
     recall.set(title="within 5 degrees, validation, %", xlabel="pairs seen", xscale="log")
-    recall.xaxis.set_minor_formatter(EngFormatter(sep=""))
-    recall.tick_params(axis="x", which="minor", labelsize="x-small")
+    recall.set_xticks([run["pairs"] for run in runs])
+    recall.xaxis.set_minor_locator(NullLocator())
     recall.legend()
     for axes in (loss, recall):
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
