@@ -8,6 +8,7 @@ from corrmat import load_model, weights
 from corrmat.methods import InvariantCorr
 from corrmat.registration import shipping
 
+FACTS = {"pairs_seen": 400, "train_seconds": 2.0, "commit": "abc", "curve": [{"loss": 1.0}]}
 NETWORK = {"width": 32, "heads": 2, "layers": 1, "anchors": 8, "neighbors": 4}
 
 
@@ -18,8 +19,6 @@ def checkpoint(tmp_path):
     content = {"state_dict": method.state_dict(), "hyper_parameters": dict(method.hparams)}
     method.on_save_checkpoint(content)
     torch.save(content, tmp_path / "last.ckpt")
-    trained = {"pairs_seen": 400, "train_seconds": 2.0, "commit": "abc", "curve": [{"loss": 1.0}]}
-    (tmp_path / "trained.json").write_text(json.dumps(trained))
     return tmp_path / "last.ckpt"
 
 
@@ -37,7 +36,7 @@ def package(tmp_path, monkeypatch):
 
 def test_a_checkpoint_becomes_the_weights_of_the_package(checkpoint, package, tmp_path, capsys):
     before = int(weights.shipped_metadata()["pairs"])
-    shipping.ship(checkpoint, tmp_path / "results")
+    shipping.ship(checkpoint, FACTS, tmp_path / "results")
     assert package.name in capsys.readouterr().out
     header = weights.shipped_metadata()
     assert header["method"] == "Invariant_corr"
@@ -62,7 +61,7 @@ def test_nothing_is_shipped_before_its_calibration_is_done(checkpoint, package, 
 
     monkeypatch.setattr(shipping, "calibrate", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        shipping.ship(checkpoint, package.parent / "results")
+        shipping.ship(checkpoint, FACTS, package.parent / "results")
     assert package.read_bytes() == before
     assert [path.name for path in package.parent.iterdir()] == [package.name]
 

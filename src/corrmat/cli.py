@@ -92,11 +92,12 @@ def train_weights(recipe: Path) -> None:
         options = parse(words)
         from corrmat.registration.shipping import ship
         from corrmat.training.recipe import load
+        from corrmat.training.runs import trained_facts
 
         experiment = load(recipe, options.scale, options.overrides)
         if (experiment.scale, experiment.data) == ("laptop", "shapes+assemblies"):
             run = options.runs / experiment.place / experiment.treatment
-            ship(run / "last.ckpt", recipe.parents[1] / "results")
+            ship(run / "last.ckpt", trained_facts(run), recipe.parents[1] / "results")
     sys.exit(code)
 
 

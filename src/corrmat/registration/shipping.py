@@ -1,7 +1,9 @@
 """A trained checkpoint becomes the weights of the package: tensors and a calibration."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
@@ -11,25 +13,24 @@ from corrmat.files import replace_text
 from corrmat.metrics import ADDS_THRESHOLD
 from corrmat.registration import benchmark
 from corrmat.reporting.provenance import commit
-from corrmat.training.runs import trained_facts
 
 CALIBRATION_PAIRS = 300
 _PROTOCOLS: tuple[benchmark.Protocol, ...] = ("real", "views", "clean")
 
 
-def ship(checkpoint: Path, results: Path) -> None:
+def ship(checkpoint: Path, facts: Mapping[str, Any], results: Path) -> None:
     """Calibrate the confidence of a checkpoint and write its weights into the package.
 
     Nothing is written before the calibration is done. Training goes on from the weights that ship,
     so that the pairs of every run are added up; results/register/training.json has its curve.
 
     Args:
-        checkpoint: of `corrmat fit`, in the folder of its run.
+        checkpoint: of `corrmat fit`.
+        facts: of its run, see `training.runs.trained_facts`.
         results: folder of records.
     """
     _, hparams, network = weights.checkpoint_network(checkpoint)
     calibration, recalls = calibrate(str(checkpoint))
-    facts = trained_facts(checkpoint.parent)
     before = int(weights.shipped_metadata().get("pairs", 0))
     pairs = before + facts["pairs_seen"]
     path = weights.ship_network(
