@@ -12,13 +12,12 @@ from conftest import ROOT
 import corrmat
 from corrmat import weights
 from corrmat.cli import main
-from corrmat.data.datamodule import PairDataset
+from corrmat.data.datamodule import PairDataset, RegistrationDataModule
 from corrmat.errors import CorrmatError
 from corrmat.metrics import RegistrationMetrics
 from corrmat.reporting.intervals import read_errors
 from corrmat.reporting.record import read_record
 from corrmat.training import experiment, recipe, shipping
-from corrmat.training.preflight import prepare
 
 PAIRS = 16  # of a test
 
@@ -60,8 +59,9 @@ def test_a_shipped_arm_matches_as_its_record_says(model):
     folder = ROOT / "results" / about["record"]
     record = read_record(folder / "metrics.json")
     assert record.data == "shapes"
-    arm = prepare(load(record.id, record.scale).arms[about["arm"]])
-    dataset = arm.datamodule.test_dataloader().dataset
+    settings = load(record.id, record.scale).arms[about["arm"]]
+    module = RegistrationDataModule(**settings.data.as_dict(), seed=settings.seed)
+    dataset = module.test_dataloader().dataset
     assert isinstance(dataset, PairDataset)
     batch = dataset.__getitems__([(0, i) for i in range(PAIRS)])
     metrics = RegistrationMetrics()
