@@ -56,8 +56,9 @@ docs: .venv/ready  ## rewrite the documents' tables, redraw the pictures of docs
 
 docs-site: .venv/ready  ## README and docs/ as a site in build/site; a broken link is an error
 	rm -rf build/site-source && mkdir -p build/site-source
-	cp --parents *.md CITATION.cff docs/* notebooks/* src/corrmat/shipped/MODEL_CARD.md \
-		$$(grep -oh 'results/[^)]*' docs/*.md | grep -E '\.(png|json)$$' | sort -u) build/site-source
+	tar cf - *.md CITATION.cff docs notebooks src/corrmat/shipped/MODEL_CARD.md \
+		$$(grep -oh 'results/[^)]*' docs/*.md | grep -E '\.(png|json)$$' | sort -u) \
+		| tar xf - -C build/site-source
 	mv build/site-source/README.md build/site-source/index.md
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
@@ -67,7 +68,7 @@ report: .venv/ready  ## report.html: every record on one page
 bench: .venv/ready  ## speed: pairs a second, training steps, ratios against a naive twin
 	$(BIN)/python benchmarks/bench.py
 
-lint: .venv/ready docs-site  ## ruff, pyright, codespell, and the layers that imports keep to
+lint: .venv/ready docs-site  ## ruff, pyright, codespell, the order of imports, and the links of the site
 	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/pyright && $(BIN)/lint-imports && $(BIN)/codespell
 
 format: .venv/ready  ## let ruff rewrite what it can

@@ -11,11 +11,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import kiss_matcher
 import numpy as np
 import open3d as o3d
 from rich.progress import track
 
+from corrmat.baselines import FpfhSettings, KissSettings, fpfh_ransac, kiss_matcher
 from corrmat.registration import benchmark
 from corrmat.registration.scoring import AlignmentScorer
 from corrmat.types import PairBatch
@@ -27,39 +27,19 @@ VOXELS_M = {"ransac": (0.08, 0.12, 0.18, 0.27, 0.4), "kiss": (0.1, 0.15, 0.22)}
 
 def ransac(source: np.ndarray, target: np.ndarray, voxel: float) -> np.ndarray:
     """Run RANSAC over FPFH features of voxelised clouds, with Open3D's customary ratios."""
-    clouds, features = [], []
+    clouds = []
     for points in (source, target):
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
         cloud = cloud.voxel_down_sample(voxel)
         cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(2 * voxel, 30))
-        search = o3d.geometry.KDTreeSearchParamHybrid(5 * voxel, 100)
-        clouds.append(cloud)
-        features.append(o3d.pipelines.registration.compute_fpfh_feature(cloud, search))
-    o3d.utility.random.seed(0)
-    registration = o3d.pipelines.registration
-    result = registration.registration_ransac_based_on_feature_matching(
-        *clouds,
-        *features,
-        True,
-        1.5 * voxel,
-        registration.TransformationEstimationPointToPoint(False),
-        3,
-        [
-            registration.CorrespondenceCheckerBasedOnEdgeLength(0.9),
-            registration.CorrespondenceCheckerBasedOnDistance(1.5 * voxel),
-        ],
-        registration.RANSACConvergenceCriteria(100_000, 0.999),
-    )
-    return np.array(result.transformation)
+        clouds.append(np.hstack([cloud.points, cloud.normals]))
+    settings = FpfhSettings(feature_radius=5 * voxel, inlier_threshold=1.5 * voxel)
+    return fpfh_ransac(*clouds, [0], settings)[0]
 
 
 def kiss(source: np.ndarray, target: np.ndarray, voxel: float) -> np.ndarray:
     """Run KISS-Matcher with its defaults."""
-    clouds = (list(points.astype(np.float32)) for points in (source, target))
-    solution = kiss_matcher.KISSMatcher(voxel).estimate(*clouds)
-    transform = np.eye(4)
-    transform[:3, :3], transform[:3, 3] = solution.rotation, np.ravel(solution.translation)
-    return transform
+    return kiss_matcher(source, target, 0, KissSettings(voxel), voxel_sampling=True)
 
 
 PIPELINES: dict[str, Callable[[np.ndarray, np.ndarray, float], np.ndarray]] = {

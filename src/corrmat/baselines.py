@@ -164,9 +164,14 @@ KISS = KissSettings(voxel_size=0.17)
 
 
 def kiss_matcher(
-    source: np.ndarray, target: np.ndarray, seed: int, settings: KissSettings = KISS
+    source: np.ndarray,
+    target: np.ndarray,
+    seed: int,
+    settings: KissSettings = KISS,
+    *,
+    voxel_sampling: bool = False,
 ) -> np.ndarray:
-    """Run KISS-Matcher (Lim et al., ICRA 2025) on all points, without its voxel sampling.
+    """Run KISS-Matcher (Lim et al., ICRA 2025), on all points or on its own voxel grid.
 
     See `fpfh_ransac`. It estimates its own normals and draws nothing at random.
     """
@@ -174,7 +179,9 @@ def kiss_matcher(
         package: Any = importlib.import_module("kiss_matcher")
     except ImportError as error:
         raise CorrmatError(f"kiss is KISS-Matcher: pip install kiss-matcher ({error})") from error
-    config = package.KISSMatcherConfig(voxel_size=settings.voxel_size, use_voxel_sampling=False)
+    config = package.KISSMatcherConfig(
+        voxel_size=settings.voxel_size, use_voxel_sampling=voxel_sampling
+    )
     clouds = (list(points[:, :3].astype(np.float32)) for points in (source, target))
     solution = package.KISSMatcher(config).estimate(*clouds)
     transform = np.eye(4)

@@ -23,28 +23,21 @@ from corrmat.reporting.provenance import commit
 from corrmat.types import PairBatch
 
 Protocol = Literal["paper", "real", "views", "clean", "rooms"]
+# Two scans: no shared point, noise, both clouds cropped, outliers, normals estimated.
+_SCANS = PairSettings(
+    keep=0.7,
+    sampling="disjoint",
+    jitter=0.01,
+    outliers=0.05,
+    corrupted="both",
+    normals="estimated",
+)
 PROTOCOLS: dict[Protocol, PairSettings] = {
     # Experiment 1.2: the same points, the source without 30 %, the mesh's own normals.
     "paper": PairSettings(keep=0.7),
-    # Two scans: no shared point, noise, both clouds cropped, outliers, normals estimated.
-    "real": PairSettings(
-        keep=0.7,
-        sampling="disjoint",
-        jitter=0.01,
-        outliers=0.05,
-        corrupted="both",
-        normals="estimated",
-    ),
+    "real": _SCANS,
     # What two depth cameras see of one object, up to 60 degrees apart.
-    "views": PairSettings(
-        keep=0.7,
-        sampling="disjoint",
-        jitter=0.01,
-        outliers=0.05,
-        corrupted="both",
-        normals="estimated",
-        views=1.0,
-    ),
+    "views": replace(_SCANS, views=1.0),
     # Two scans without crop and outliers.
     "clean": PairSettings(sampling="disjoint", jitter=0.01, normals="estimated"),
 }

@@ -11,7 +11,7 @@ from rich.progress import track
 from scipy.spatial.transform import Rotation
 
 from corrmat.errors import CorrmatError
-from corrmat.registration.register import MIN_CONFIDENCE, Refine, register
+from corrmat.registration.register import MIN_CONFIDENCE, Refine, matrix_lines, register
 
 _SWEEPS = 50  # of averaging; poses settle within ten
 _ANGLE_DEG, _SHARE = 10.0, 0.1  # how far a registration may be off the poses to agree with them
@@ -69,7 +69,7 @@ def to_text(paths: Sequence[Path], target: Path, poses: Sequence[ScanPose]) -> s
     lines = [f"every scan onto {target} (target = matrix @ scan):"]
     for path, pose in zip(paths, poses, strict=True):
         lines.append(f"{path}: {pose.verdict}, confidence {pose.confidence:.0%}")
-        lines += ["  ".join(f"{v: .12g}".rjust(20) for v in row) for row in pose.transform]
+        lines += matrix_lines(pose.transform)
     return "\n".join(lines)
 
 

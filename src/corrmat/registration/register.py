@@ -214,13 +214,10 @@ def _cached_network(model: str, file: tuple[str, int, int] | None) -> NetworkHyp
 
 def to_text(registration: Registration) -> str:
     """Format a registration for people."""
-    rows = [
-        "  ".join(f"{value: .12g}".rjust(20) for value in row) for row in registration.transform
-    ]
     x, y, z = registration.transform[:3, 3]
     lines = [
         "matrix (target = matrix @ source):",
-        *rows,
+        *matrix_lines(registration.transform),
         f"rotation     {registration.rotation_deg:.3f} deg",
         f"translation  {x:.6g} {y:.6g} {z:.6g}",
         f"overlap      {registration.overlap:.1%} of the source has a target point near",
@@ -233,6 +230,11 @@ def to_text(registration: Registration) -> str:
     return "\n".join(
         [*lines, f"({registration.model}, seed {registration.seed}, {registration.seconds:.2f} s)"]
     )
+
+
+def matrix_lines(transform: np.ndarray) -> list[str]:
+    """Format a transform (4, 4), a line a row."""
+    return ["  ".join(f"{value: .12g}".rjust(20) for value in row) for row in transform]
 
 
 def to_json(registration: Registration) -> str:

@@ -30,6 +30,12 @@ class AlignmentScorer:
             small_gicp.estimate_normals_covariances(cloud, num_neighbors=min(12, cloud.size()))
         return clouds[0], clouds[1], small_gicp.KdTree(clouds[1])
 
+    @functools.cached_property
+    def _normals(self) -> tuple[np.ndarray, np.ndarray]:
+        """Unit normals of source (N, 3) and target (M, 3), of any sign."""
+        source, target, _ = self._clouds
+        return np.asarray(source.normals())[:, :3], np.asarray(target.normals())[:, :3]
+
     def refine(self, transform: np.ndarray) -> np.ndarray:
         """Refine a transform (4, 4) by generalised ICP (Segal et al., RSS 2009)."""
         source, target, tree = self._clouds
@@ -50,14 +56,14 @@ class AlignmentScorer:
         A point counts the less the farther away the nearest point of the other cloud is, and the
         more the two normals differ, whose sign is unknown.
         """
-        normals = [np.asarray(cloud.normals())[:, :3] for cloud in self._clouds[:2]]
-        moved = normals[0] @ transform[:3, :3].T
+        normals, target_normals = self._normals
+        moved = normals @ transform[:3, :3].T
         (distance, index), (back_distance, back_index) = self._nearest(transform)
         scores = [
             np.clip(1 - (d / self.max_distance) ** 2, 0, None) @ np.abs((a * b).sum(1)) / len(d)
             for d, a, b in (
-                (distance, moved, normals[1][index]),
-                (back_distance, normals[1], moved[back_index]),
+                (distance, moved, target_normals[index]),
+                (back_distance, target_normals, moved[back_index]),
             )
         ]
         return float(np.mean(scores))

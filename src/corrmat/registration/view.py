@@ -2,21 +2,16 @@
 
 import json
 
-import jinja2
 import numpy as np
 import plotly.graph_objects as go
 from scipy.spatial.transform import Rotation
 
 from corrmat.registration.register import Registration
 from corrmat.reporting.figures import BLUE, GREEN, GREY, RED, thin
+from corrmat.reporting.html import render
 
 MAX_POINTS = 4000  # drawn of a cloud
 MAX_LINES = 150  # strongest matches drawn
-_ENVIRONMENT = jinja2.Environment(
-    loader=jinja2.PackageLoader("corrmat.reporting"),
-    autoescape=True,
-    undefined=jinja2.StrictUndefined,
-)
 
 
 def registration_page(registration: Registration, source: np.ndarray, target: np.ndarray) -> str:
@@ -61,7 +56,8 @@ def registration_page(registration: Registration, source: np.ndarray, target: np
         "turn": Rotation.from_matrix(rotation.T).as_rotvec().tolist(),
         "beside": beside,
     }
-    return _ENVIRONMENT.get_template("registration.html.j2").render(
+    return render(
+        "registration.html.j2",
         registration=registration,
         motion=json.dumps(motion),
         plot=figure.to_html(

@@ -230,22 +230,22 @@ def draw_matches(
     view = principal_axes(np.asarray(snapshot.target))
     before, *_, after = stages(_turned(snapshot, view))
     right = f"{100 * match_accuracy(snapshot):.0f} % of the matches are right"
-    scenes = [(f"{snapshot.arm}: {right}", before)]
+    scenes = [(f"{snapshot.arm}: {right}", before, True)]
     if rival is not None:
         x = np.asarray(snapshot.source)
         moved = (x @ np.asarray(rival.rotation).T + np.asarray(rival.translation)) @ view
         none = np.zeros(len(x), bool)
         scene = Stage(rival.arm, moved, after.target, np.zeros(len(x), np.int64), none)
-        scenes.append((f"{rival.arm}: {_degrees(rival.rotation_error_deg)} off", scene))
-    scenes.append((f"{snapshot.arm}: {_degrees(snapshot.rotation_error_deg)} off", after))
-    boxes = [_box(_project(np.concatenate([s.source, s.target]))) for _, s in scenes]
+        scenes.append((f"{rival.arm}: {_degrees(rival.rotation_error_deg)} off", scene, False))
+    scenes.append((f"{snapshot.arm}: {_degrees(snapshot.rotation_error_deg)} off", after, True))
+    boxes = [_box(_project(np.concatenate([s.source, s.target]))) for _, s, _ in scenes]
     widths = [min(max(box[0] / box[1], 1), 3) for box in boxes]  # room for the headings
     figure = Figure(figsize=(10, min(1 + 10 / sum(widths), 6)), layout="constrained")
     figure.suptitle(title)
-    for axes, (heading, scene) in zip(
+    for axes, (heading, scene, has_matches) in zip(
         figure.subplots(1, len(scenes), width_ratios=widths), scenes, strict=True
     ):
-        _draw_scene(axes, scene, has_matches=heading != scenes[1][0] or rival is None)
+        _draw_scene(axes, scene, has_matches=has_matches)
         axes.set_title(heading, fontsize="medium")
     figure.axes[-1].legend(fontsize="x-small", loc="best")
     save(figure, path)
@@ -323,8 +323,13 @@ def _box(points: np.ndarray) -> np.ndarray:
     return np.ptp(points, 0).clip(1e-3)
 
 
-def save(figure: Figure, path: Path, dpi: int = 110) -> None:
-    """Write a PNG atomically; the same figure gives the same bytes."""
+def to_png(figure: Figure, dpi: int = 110) -> bytes:
+    """Render a figure as a PNG; the same figure gives the same bytes."""
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=dpi, metadata={"Software": None})
-    replace_bytes(path, content.getbuffer())
+    return content.getvalue()
+
+
+def save(figure: Figure, path: Path, dpi: int = 110) -> None:
+    """Write a figure as a PNG, atomically."""
+    replace_bytes(path, to_png(figure, dpi))

@@ -1,12 +1,12 @@
 """The correspondence matrices of one pair: what the paper's loss does to a network, at a glance."""
 
-import io
 from pathlib import Path
 
 import numpy as np
 import torch
 from matplotlib.figure import Figure
 
+from corrmat.reporting.figures import to_png
 from corrmat.reporting.record import read_snapshots
 from corrmat.weights import load_model, shipped_metadata, shipped_models
 
@@ -47,6 +47,4 @@ def draw_matrices(results: Path) -> bytes | None:
         loss = "the correspondence matrix" if name.endswith("_corr") else "the transform"
         axes.set_title(f"trained on {loss}: {right:.0%} right", fontsize="medium")
         axes.set(xlabel="target points", ylabel="source points", xticks=[], yticks=[])
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=110, metadata={"Software": None})
-    return content.getvalue()
+    return to_png(figure)

@@ -6,22 +6,17 @@ import json
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import jinja2
 from plotly.offline import get_plotlyjs
 
 from corrmat.reporting import plots
 from corrmat.reporting.claims import claims_of
+from corrmat.reporting.html import render
 from corrmat.reporting.overview import draw_overview, longest_records
 from corrmat.reporting.provenance import command, staleness
 from corrmat.reporting.record import Record, read_records, read_snapshots
 from corrmat.reporting.tables import METRICS, cell, effort, paper_metric, ratio, table
 
 REPOSITORY = Path(__file__).resolve().parents[3]
-_ENVIRONMENT = jinja2.Environment(
-    loader=jinja2.PackageLoader("corrmat.reporting"),
-    autoescape=True,
-    undefined=jinja2.StrictUndefined,
-)
 
 
 @dataclass
@@ -58,7 +53,7 @@ def build_page(results: Path) -> str:
         HTML with everything in it.
     """
     records = sorted(read_records(results), key=lambda r: (r.id, r.scale, r.data, r.seed))
-    shown = [record for record in records if record.scale != "smoke" and record.seed == 0]
+    longest = longest_records(records)
     figures: dict[str, plots.Plot] = {}
     sections = []
     for identity, group in itertools.groupby(records, key=lambda r: r.id):
@@ -66,9 +61,10 @@ def build_page(results: Path) -> str:
         title = f"{identity} {same[0].family}: {same[0].title}"
         articles = [_article(record, results, figures) for record in same]
         sections.append(Section(identity, title, articles))
-    return _ENVIRONMENT.get_template("records.html.j2").render(
+    return render(
+        "records.html.j2",
         claims=claims_of(records, results),
-        overview=base64.b64encode(draw_overview(longest_records(shown))).decode() if shown else "",
+        overview=base64.b64encode(draw_overview(longest)).decode() if longest else "",
         summary=[row for record in records for row in _summary_rows(record)],
         sections=sections,
         robustness=_robustness(results, figures),
