@@ -92,11 +92,19 @@ lock: .venv/ready  ## compile requirements.lock anew from pyproject.toml
 clean:  ## remove the environment and all runs (results/ stays)
 	rm -rf .venv .venv-oldest runs
 
+# Where there is no GPU: PyTorch without CUDA, if its own index answers (1.5 GB on disk instead of 6).
+TORCH_WITHOUT_CUDA = [ "$$(uname)" = Linux ] && ! command -v nvidia-smi > /dev/null 2>&1 \
+	&& UV_HTTP_RETRIES=0 $(BIN)/uv pip install --quiet --python $(BIN)/python --torch-backend cpu \
+		--no-deps "$$(grep -o '^torch==[^ ]*' requirements.lock)" 2> /dev/null
+
 .venv/ready: requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "corrmat needs Python 3.11 or newer; name one with PYTHON=...")'
 	$(PYTHON) -m venv --clear .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv==$(UV_VERSION)
-	$(BIN)/uv pip install --quiet --python $(BIN)/python --require-hashes -r requirements.lock
+	@if $(TORCH_WITHOUT_CUDA); then \
+		awk '/^[a-z]/ {keep = !/^(cuda|nvidia|torch|triton)[-=]/} keep' requirements.lock; \
+	else cat requirements.lock; fi > .venv/requirements.lock
+	$(BIN)/uv pip install --quiet --python $(BIN)/python --no-deps --require-hashes -r .venv/requirements.lock
 	$(BIN)/uv pip install --quiet --python $(BIN)/python --no-build-isolation --no-deps --editable .
 	@$(BIN)/corrmat run --help > /dev/null  # writes the byte code of torch and lightning
 	@touch $@

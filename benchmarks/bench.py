@@ -55,6 +55,7 @@ from corrmat.registration.benchmark import frozen_pairs  # noqa: E402
 from corrmat.registration.example import write_example  # noqa: E402
 from corrmat.registration.hypotheses import CLASSICAL  # noqa: E402
 from corrmat.registration.register import register  # noqa: E402
+from corrmat.reporting.figures import BLUE, GREEN, RED  # noqa: E402
 from corrmat.training.fit import fresh_method  # noqa: E402
 from corrmat.training.hardware import keep_freed_memory  # noqa: E402
 from corrmat.training.preflight import prepare  # noqa: E402
@@ -457,11 +458,19 @@ def draw(growth: dict[str, list[Row]], exponents: dict[str, Any], path: Path) ->
     for axes, name, title in zip(
         panels, ("seconds", "peak_mb"), ("seconds a pair", "peak memory, MB"), strict=True
     ):
-        for what, measured in growth.items():
+        for (what, measured), colour in zip(growth.items(), (BLUE, RED, GREEN), strict=True):
             points = [(row["n"], row[name]) for row in measured if row[name] > 0]
-            axes.loglog(
-                *zip(*points, strict=True), "o-", label=f"{what}: N^{exponents[what][name]}"
-            )
+            label = f"{what}: N^{exponents[what][name]}"
+            axes.loglog(*zip(*points, strict=True), "o-", color=colour, label=label)
+        # Slopes to compare with, through the lower left corner.
+        (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+        n = np.geomspace(left, right)
+        for power in (1, 2):
+            label = f"N^{power}" if power > 1 else "N"
+            axes.loglog(n, low * (n / left) ** power, ":", color="grey", zorder=0)
+            end = min(right, left * (high / low) ** (1 / power))
+            axes.annotate(label, (end, low * (end / left) ** power), ha="right", va="top", color="grey")
+        axes.set(xlim=(left, right), ylim=(low, high))
         axes.set(xlabel="points N of either cloud", title=title)
         axes.set_xticks(POINTS, [str(n) for n in POINTS], minor=False)
         axes.tick_params(axis="x", which="minor", bottom=False, labelbottom=False)

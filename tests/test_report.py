@@ -1,3 +1,4 @@
+import json
 import re
 import subprocess
 
@@ -115,6 +116,31 @@ def test_panels_show_training_bands_or_the_sweep():
         "outliers in the test, %"
     ] * 2
     assert shown[-1].series[0][2:4] == ([40], [3.0])
+
+
+def test_arms_of_different_pace_are_shown_against_minutes_too():
+    arms = {arm: dict(entry) for arm, entry in RECORD["arms"].items()}
+    arms["DCP"]["train_seconds"] = 30 * arms["DCP_corr"]["train_seconds"]
+    shown = figures.panels(Record.from_json(RECORD | {"arms": arms}))
+    assert [panel.title for panel in shown if panel.xlabel == "minutes of training"] == [
+        "correct matches, %", "rotation error, mean, deg",
+    ]  # fmt: skip
+    ends = {s.arm: s.x[-1] for s in shown[-2].series if s.source == "arm"}
+    # Half of the 32 pairs, which take DCP_corr 90 seconds and DCP 30 times as long.
+    assert ends == {"DCP": 22.5, "DCP_corr": 0.75}
+
+
+def test_what_the_paper_misprinted_is_marked():
+    """RPMNet_corr's Chamfer distance of 120 to 150 degrees in table 2."""
+    record = Record.from_json(
+        json.loads((ROOT / "results/laptop/shapes/2.4/metrics.json").read_text())
+    )
+    chamfer = next(p for p in figures.panels(record) if p.title.startswith("Chamfer"))
+    marked = [(s.arm, s.x, s.y) for s in chamfer.series if s.source == "misprint"]
+    assert marked == [("RPMNet_corr", [135], [0.12e-5])]
+    assert [c for row in tables.table(record)[1] for c in row if "misprint" in c] == [
+        "1.2e-06 (misprint)"
+    ]
 
 
 @pytest.mark.parametrize(

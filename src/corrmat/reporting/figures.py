@@ -1,7 +1,7 @@
 """Figures of a record: the paper's curves, and which points were matched with which."""
 
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -15,7 +15,7 @@ from matplotlib.ticker import EngFormatter, LogFormatter, NullFormatter
 from corrmat.files import replace_bytes
 from corrmat.reporting.record import ArmResult, Record, Subset, defined
 from corrmat.reporting.snapshots import PairSnapshot, SnapshotStep, Stage, match_accuracy, stages
-from corrmat.reporting.tables import METRICS
+from corrmat.reporting.tables import METRICS, MISPRINTS
 
 # The columns of the paper's figures 5, 6 and 7, by family.
 PANELS = {
@@ -24,16 +24,17 @@ PANELS = {
     "PCRNet": ("loss", "match_accuracy", "naive_euler_rmse_deg", "rotation_error_deg_mean"),
 }
 _OTHER_PANELS = ("loss", "match_accuracy", "rotation_error_deg_mean", "translation_rmse")
-_PAIRS = "training pairs seen"
+_PAIRS, _MINUTES = "training pairs seen", "minutes of training"
 _BAND_PANELS = ("match_accuracy", "relative_euler_mae_deg", "chamfer")
 _SWEEP_PANELS = ("match_accuracy", "relative_euler_rmse_deg")
 # Okabe and Ito's palette, which the colour-blind can tell apart.
 RED, BLUE, GREEN, PURPLE, GREY = "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#999999"
 MAX_LINES = 150  # matches drawn
-Source = Literal["arm", "paper", "baseline"]
+Source = Literal["arm", "paper", "misprint", "baseline"]
 _STYLES: dict[Source, dict[str, Any]] = {
     "arm": {"linewidth": 1.4},
     "paper": {"linestyle": ":", "linewidth": 1.4},
+    "misprint": {"marker": "X", "linestyle": ""},
     "baseline": {"linestyle": "--", "linewidth": 1.2},
 }
 
@@ -59,7 +60,8 @@ class CurveSeries(NamedTuple):
     @property
     def label(self) -> str:
         """The entry in the legend."""
-        return {"arm": "", "paper": "paper, ", "baseline": "guess: "}[self.source] + self.arm
+        before = {"arm": "", "paper": "paper, ", "misprint": "misprinted, ", "baseline": "guess: "}
+        return before[self.source] + self.arm
 
 
 class Panel(NamedTuple):
@@ -83,7 +85,8 @@ def arm_colours(record: Record) -> dict[str, str]:
 def panels(record: Record) -> list[Panel]:
     """Describe the curves of a record.
 
-    They show validation during training against pairs seen, in the paper's columns (`PANELS`).
+    They show validation during training against pairs seen, in the paper's columns (`PANELS`), and
+    against minutes as well if a pair takes one arm more than twice as long as another.
     Tests in bands of initial misalignment (1.4 and 2.4) are shown against the band instead, and
     tests with other shares of outliers against the share.
     """
@@ -92,16 +95,25 @@ def panels(record: Record) -> list[Panel]:
         return [_subset_panel(record, name, "bands") for name in _BAND_PANELS]
     names = PANELS.get(record.family, _OTHER_PANELS)
     sweep = [_subset_panel(record, name, "sweep") for name in _SWEEP_PANELS if first.sweep]
-    return [_training_panel(record, name) for name in names] + sweep
+    training = [_training_panel(record, name) for name in names]
+    paces = [arm.train_seconds / arm.pairs_seen for arm in record.arms.values() if arm.pairs_seen]
+    if paces and max(paces) > 2 * min(paces) > 0:
+        against = ("match_accuracy", "rotation_error_deg_mean")
+        training += [_training_panel(record, name, _MINUTES) for name in against]
+    return training + sweep
 
 
-def _training_panel(record: Record, name: str) -> Panel:
-    """Describe the curves of one validation metric (or of the training loss)."""
+def _training_panel(record: Record, name: str, xlabel: str = _PAIRS) -> Panel:
+    """Describe the curves of one validation metric (or of the training loss).
+
+    Minutes are the arm's own, spread evenly over its pairs.
+    """
     title, _, factor = METRICS.get(name, ("training loss, share of its start", "", 1))
     series: list[CurveSeries] = []
     lengths = []
     for arm, colour, result in _arms(record):
-        pairs = [point["pairs_seen"] for point in result.curve]
+        pace = result.train_seconds / 60 / (result.pairs_seen or 1) if xlabel == _MINUTES else 1
+        pairs = [pace * point["pairs_seen"] for point in result.curve]
         lengths.append(max(pairs, default=1))
         values = [defined(point.get(name)) for point in result.curve]
         if pairs and None not in values:
@@ -111,7 +123,7 @@ def _training_panel(record: Record, name: str) -> Panel:
             series.append(CurveSeries(arm, colour, pairs, y))
         final = record.paper[arm].get(name) if arm in record.paper else None
         if pairs and final is not None:
-            ends = [min(pairs[0], pairs[-1] // 2), pairs[-1]]
+            ends = [min(pairs[0], pairs[-1] / 2), pairs[-1]]
             series.append(CurveSeries(arm, colour, ends, [factor * final] * 2, "paper"))
     guess = record.baselines.get("identity", ArmResult({})).get(name)
     if series and guess:
@@ -119,9 +131,9 @@ def _training_panel(record: Record, name: str) -> Panel:
         series.append(
             CurveSeries("identity", GREY, [min(x), max(x)], [factor * guess] * 2, "baseline")
         )
-    log_x = max(lengths) > 4 * min(lengths)  # laptop's PCRNet: equal minutes, not equal pairs
+    log_x = max(lengths, default=1) > 4 * min(lengths, default=1)  # laptop's PCRNet: equal minutes, not equal pairs
     log_y = name not in ("loss", "match_accuracy")
-    return Panel(title, _PAIRS, log_x, log_y, series)
+    return Panel(title, xlabel, log_x, log_y, series)
 
 
 def _subset_panel(record: Record, name: str, part: str) -> Panel:
@@ -132,11 +144,16 @@ def _subset_panel(record: Record, name: str, part: str) -> Panel:
         sources: dict[Source, ArmResult | None] = {"arm": result, "paper": record.paper.get(arm)}
         for source, values in sources.items():
             subsets: list[Subset] = getattr(values, part) if values else []
-            points = [(s.position, defined(s.metrics.get(name))) for s in subsets]
-            available = [(x, factor * y) for x, y in points if y is not None]
-            if available:
+            points: dict[Source, list[tuple[float, float]]] = {}
+            for subset in subsets:
+                value = defined(subset.metrics.get(name))
+                if value is not None:
+                    is_wrong = (record.id, arm, subset.label, name) in MISPRINTS
+                    of = "misprint" if source == "paper" and is_wrong else source
+                    points.setdefault(of, []).append((subset.position, factor * value))
+            for of, available in points.items():
                 x, y = map(list, zip(*available, strict=True))
-                series.append(CurveSeries(arm, colour, x, y, source))
+                series.append(CurveSeries(arm, colour, x, y, of))
     xlabel = "initial misalignment, deg" if part == "bands" else "outliers in the test, %"
     log_y = name != "match_accuracy"
     return Panel(title, xlabel, False, log_y, series, bars=part == "bands")
@@ -171,13 +188,17 @@ def draw_curves(record: Record, path: Path) -> None:
     ends = [value for series in training for value in (series.x[0], series.x[-1])]
     for axes, panel in zip(figure.subplots(rows, columns).flat, all_panels, strict=True):
         if panel.bars:
-            _draw_bars(axes, panel.series)
+            _draw_bars(axes, panel.series, record.controls)
+            axes.set_xticks(record.bands_deg)
         for series in [] if panel.bars else panel.series:
             marker = "." if series.source == "arm" and len(series.x) <= 40 else ""
             style = _STYLES[series.source] | {"marker": marker}
+            if series.source == "arm" and series.arm in record.controls:
+                style["linestyle"] = "-."  # not by colour alone
             axes.plot(series.x, series.y, color=series.colour, label=series.label, **style)
         if panel.log_x:
             axes.set_xscale("log")
+            axes.xaxis.set_major_formatter("{x:g}")
             axes.xaxis.set_minor_formatter(NullFormatter())
         if panel.xlabel == _PAIRS and ends:
             axes.set_xlim(0.9 * min(ends) if panel.log_x else 0, 1.05 * max(ends))
@@ -198,8 +219,11 @@ def draw_curves(record: Record, path: Path) -> None:
     save(figure, path)
 
 
-def _draw_bars(axes: Axes, series: list[CurveSeries]) -> None:
-    """Draw a bar for every band and arm, and a diamond where the paper's value is."""
+def _draw_bars(axes: Axes, series: list[CurveSeries], controls: Sequence[str]) -> None:
+    """Draw a bar for every band and arm, and a diamond where the paper's value is.
+
+    Bars of controls are hatched.
+    """
     arms = list(dict.fromkeys(s.arm for s in series))
     for arm_series in series:
         x = np.asarray(arm_series.x)
@@ -207,9 +231,11 @@ def _draw_bars(axes: Axes, series: list[CurveSeries]) -> None:
         at = x + width * (arms.index(arm_series.arm) - (len(arms) - 1) / 2)
         style: dict[str, Any] = {"color": arm_series.colour, "label": arm_series.label}
         if arm_series.source == "arm":
-            axes.bar(at, arm_series.y, width, alpha=0.75, **style)
+            hatch = "////" if arm_series.arm in controls else ""
+            axes.bar(at, arm_series.y, width, alpha=0.75, hatch=hatch, edgecolor="white", **style)
         else:
-            style |= {"marker": "D", "s": 26, "edgecolors": "black", "zorder": 3}
+            marker = "X" if arm_series.source == "misprint" else "D"
+            style |= {"marker": marker, "s": 26, "edgecolors": "black", "zorder": 3}
             axes.scatter(at, arm_series.y, **style)
 
 
