@@ -24,6 +24,7 @@ from corrmat.baselines import is_available
 from corrmat.errors import CorrmatError
 from corrmat.metrics import rotation_error_deg
 from corrmat.module import RegistrationModule
+from corrmat.registration import benchmark
 from corrmat.reporting.page import build_page
 from corrmat.reporting.record import Record, read_snapshots
 from corrmat.training import console, experiment, fit, hardware, recipe
@@ -560,3 +561,15 @@ def test_training_starts_from_other_weights():
     other = recipe.load(ROOT / "configs" / "weights.yaml", "laptop", smaller).arms["Invariant_corr"]
     with pytest.raises(CorrmatError, match="does not fit"):
         fit.fresh_method(other)
+
+
+def test_a_layer_more_than_the_weights_have_changes_nothing():
+    shipped = weights.load_model()
+    hparams = json.loads(weights.shipped_metadata()["network"])
+    deeper = {"network": {**hparams, "layers": hparams["layers"] + 1}}
+    settings = recipe.load(ROOT / "configs" / "weights.yaml", "laptop", deeper)
+    grown = fit.fresh_method(settings.arms["Invariant_corr"]).network.eval()
+    pairs = benchmark.frozen_pairs("real", count=1)
+    with torch.no_grad():
+        before, after = (net(pairs.source, pairs.target) for net in (shipped, grown))
+    torch.testing.assert_close(after.correspondence.prob(), before.correspondence.prob())

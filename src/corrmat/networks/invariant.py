@@ -132,7 +132,10 @@ class NeighborhoodEmbedding(nn.Module):
 
 
 class Layer(nn.Module):
-    """Self-attention with pair features, cross-attention to the other cloud, feed-forward."""
+    """Self-attention with pair features, cross-attention to the other cloud, feed-forward.
+
+    A new layer changes nothing, so that one can be added to a trained network.
+    """
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -140,6 +143,10 @@ class Layer(nn.Module):
         self.between = Attention(width, heads)
         self.feedforward = FeedForward(width, 2 * width, width)
         self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(4))
+        for last in (self.within.out, self.between.out, self.feedforward[-1]):
+            assert isinstance(last, nn.Linear)
+            nn.init.zeros_(last.weight)
+            nn.init.zeros_(last.bias)
 
     def forward(self, x: Tensor, other: Tensor, pairs: Tensor, anchors: Tensor) -> Tensor:
         """Update features (B, N, d) of a cloud.

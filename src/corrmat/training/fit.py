@@ -123,12 +123,14 @@ def fresh_method(settings: ArmSettings) -> Method:
     """Build the method where training starts: with the weights that its seed gives, or others.
 
     Raises:
-        CorrmatError: the weights to start from are of another network.
+        CorrmatError: the weights to start from are of another network. They may be of a smaller
+            one: what they lack starts as the seed gives it.
     """
     L.seed_everything(settings.seed, workers=True, verbose=False)
     method = build_method(settings)
     if settings.start is not None:
-        load_state(method.network, load_model(settings.start).state_dict()).train()
+        start = load_model(settings.start).state_dict()
+        load_state(method.network, method.network.state_dict() | start).train()
     return method
 
 
