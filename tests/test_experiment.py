@@ -13,10 +13,12 @@ import signal
 import socket
 import sys
 
+import numpy as np
 import pytest
 import torch
 from conftest import ROOT, shared
 from rich.console import Console
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from corrmat import weights
@@ -119,6 +121,9 @@ def test_smoke_run_leaves_a_whole_record(identity, smoke_run):
     errors = [snapshot.rotation_error_deg for snapshot in snapshots]
     assert errors == sorted(errors)
     assert all(len(s.steps[-1].matched) == len(s.source) for s in snapshots)
+    for snapshot in snapshots:
+        distance, _ = KDTree(snapshot.clean).query(snapshot.source)
+        assert np.median(distance) < 0.1  # the source lies on the shape that is drawn behind it
     for picture in ("curves.png", "matches.png"):
         assert (folder / picture).read_bytes().startswith(b"\x89PNG")
     assert "correct matches, %" in printed

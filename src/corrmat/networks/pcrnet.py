@@ -6,7 +6,7 @@ from torch import Tensor, nn
 
 from corrmat.errors import require_positive
 from corrmat.networks.matching import MatchingHead
-from corrmat.networks.pointnet import PointNet
+from corrmat.networks.pointnet import PointNet, keep_signal_size
 from corrmat.ops import rigid
 from corrmat.ops.rigid import procrustes
 from corrmat.types import Prediction, last_of
@@ -17,7 +17,8 @@ class PCRNetwork(nn.Module):
 
     Every iteration moves the source by the predicted pose and composes the poses, with their
     gradient. The last layer is initialised near the identity pose: from an arbitrary pose, eight
-    iterations diverge and nothing is learnt.
+    iterations diverge and nothing is learnt. The layers before it keep the size of their input:
+    with torch's default weights the pose would hardly depend on the clouds, and stay there.
 
     Args:
         width: dimension of a cloud's global feature.
@@ -32,14 +33,17 @@ class PCRNetwork(nn.Module):
         self.iterations = iterations
         self.embed = PointNet(width)
         sizes = (2 * width, 1024, 1024, 512, 512, 256)
-        hidden = [
-            layer
-            for i, o in zip(sizes, sizes[1:], strict=False)
-            for layer in (nn.Linear(i, o), nn.ReLU())
-        ]
+        hidden = nn.Sequential(
+            *(
+                layer
+                for i, o in zip(sizes, sizes[1:], strict=False)
+                for layer in (nn.Linear(i, o), nn.ReLU())
+            )
+        )
+        keep_signal_size(hidden)
         last = nn.Linear(256, 7)
         with torch.no_grad():
-            last.weight.mul_(0.1)
+            last.weight.mul_(0.01)
             last.bias.copy_(torch.tensor([1.0, 0, 0, 0, 0, 0, 0]))
         self.pose = nn.Sequential(*hidden, last)
 

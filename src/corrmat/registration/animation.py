@@ -11,7 +11,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from corrmat.registration.register import Registration
-from corrmat.reporting.figures import BLUE, GREEN, GREY, RED, principal_axes, thin
+from corrmat.reporting.figures import BLUE, GREEN, GREY, RED, principal_axes
+from corrmat.reporting.snapshots import thin
 
 MAX_POINTS = 900  # drawn of a cloud
 MAX_LINES = 60  # strongest matches drawn

@@ -7,8 +7,9 @@ import plotly.graph_objects as go
 from scipy.spatial.transform import Rotation
 
 from corrmat.registration.register import Registration
-from corrmat.reporting.figures import BLUE, GREEN, GREY, RED, thin
+from corrmat.reporting.figures import BLUE, GREEN, GREY, RED
 from corrmat.reporting.html import render
+from corrmat.reporting.snapshots import thin
 
 MAX_POINTS = 4000  # drawn of a cloud
 MAX_LINES = 150  # strongest matches drawn

@@ -258,13 +258,15 @@ def draw_matches(
     right = f"{100 * match_accuracy(snapshot):.0f} % of the matches are right"
     scenes = [(f"{snapshot.arm}: {right}", before, True)]
     if rival is not None:
-        x = np.asarray(snapshot.source)
-        moved = (x @ np.asarray(rival.rotation).T + np.asarray(rival.translation)) @ view
-        none = np.zeros(len(x), bool)
-        scene = Stage(rival.arm, moved, after.target, np.zeros(len(x), np.int64), none)
+        moved, shape = (
+            (np.asarray(c) @ np.asarray(rival.rotation).T + np.asarray(rival.translation)) @ view
+            for c in (snapshot.source, snapshot.clean)
+        )
+        none = np.zeros(len(moved), bool)
+        scene = Stage(rival.arm, moved, after.target, np.zeros(len(moved), np.int64), none, shape)
         scenes.append((f"{rival.arm}: {_degrees(rival.rotation_error_deg)} off", scene, False))
     scenes.append((f"{snapshot.arm}: {_degrees(snapshot.rotation_error_deg)} off", after, True))
-    boxes = [_box(_project(np.concatenate([s.source, s.target]))) for _, s, _ in scenes]
+    boxes = [_box(_project(np.concatenate([s.shape, s.source, s.target]))) for _, s, _ in scenes]
     widths = [min(max(box[0] / box[1], 1), 3) for box in boxes]  # room for the headings
     figure = Figure(figsize=(10, min(1 + 10 / sum(widths), 6)), layout="constrained")
     figure.suptitle(title)
@@ -273,7 +275,8 @@ def draw_matches(
     ):
         _draw_scene(axes, scene, has_matches=has_matches)
         axes.set_title(heading, fontsize="medium")
-    figure.axes[-1].legend(fontsize="x-small", loc="best")
+    handles, labels = figure.axes[-1].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize="small")
     save(figure, path)
 
 
@@ -283,11 +286,12 @@ def _degrees(error: float) -> str:
 
 
 def _draw_scene(axes: Axes, scene: Stage, *, has_matches: bool) -> None:
-    """Draw two clouds and, if there are any, the matches between them."""
+    """Draw two clouds, the shape behind the source, and the matches between them if asked to."""
     source, target = _project(scene.source), _project(scene.target)
+    axes.scatter(*_project(scene.shape).T, s=7, color="0.85", linewidths=0, zorder=0, label="shape")
     if has_matches:
         axes.add_collection(_match_lines(scene, source, target))
-    axes.scatter(*target.T, s=22, color="#9ecae9", linewidths=0, label="target")
+    axes.scatter(*target.T, s=18, color="#9ecae9", linewidths=0, label="target")
     axes.scatter(*source.T, s=4, color="black", linewidths=0, label="source")
     outlier = scene.called_outlier
     if outlier.any():
@@ -297,11 +301,6 @@ def _draw_scene(axes: Axes, scene: Stage, *, has_matches: bool) -> None:
         )
     axes.set_aspect("equal")
     axes.set_axis_off()
-
-
-def thin(points: np.ndarray, count: int) -> np.ndarray:
-    """Take at most so many of the points (N, 3), evenly over their order."""
-    return points[np.linspace(0, len(points) - 1, min(count, len(points))).astype(int)]
 
 
 def principal_axes(points: np.ndarray) -> np.ndarray:
@@ -324,8 +323,11 @@ def _turned(snapshot: PairSnapshot, view: np.ndarray) -> PairSnapshot:
         )
         for step in snapshot.steps
     ]
-    source, target = (np.asarray(c) @ view for c in (snapshot.source, snapshot.target))
-    return replace(snapshot, source=source.tolist(), target=target.tolist(), steps=steps)
+    clouds = {
+        name: (np.asarray(getattr(snapshot, name)) @ view).tolist()
+        for name in ("source", "target", "clean")
+    }
+    return replace(snapshot, steps=steps, **clouds)
 
 
 def _match_lines(stage: Stage, source: np.ndarray, target: np.ndarray) -> LineCollection:

@@ -10,6 +10,7 @@ from torch import Tensor
 from corrmat.types import PairBatch, Prediction
 
 Points = list[list[float]]
+_CLEAN_POINTS = 600  # kept of the clean cloud
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,7 @@ class PairSnapshot:
     target: Points  # (M, 3)
     match: list[int]  # (N,) true target index; M for an outlier
     steps: list[SnapshotStep]
+    clean: Points  # (P, 3) of the whole shape, in the source's frame
 
     @staticmethod
     def from_json(content: Mapping[str, object]) -> "PairSnapshot":
@@ -50,6 +52,7 @@ class Stage(NamedTuple):
     target: np.ndarray  # (M, 3)
     matched: np.ndarray  # (N,) predicted target index; M for an outlier
     correct: np.ndarray  # (N,) bool
+    shape: np.ndarray  # (P, 3) the whole shape, where this stage puts the source
 
     @property
     def called_outlier(self) -> np.ndarray:
@@ -87,6 +90,7 @@ def take_snapshot(
         target=_rounded(batch.target[0, :, :3], 4),
         match=batch.match[0].tolist(),
         steps=steps,
+        clean=np.round(thin(batch.clean[0].numpy().astype(float), _CLEAN_POINTS), 3).tolist(),
     )
 
 
@@ -95,14 +99,15 @@ def stages(snapshot: PairSnapshot) -> list[Stage]:
 
     Before, the target is set aside along x, so that the matches can be seen.
     """
-    x, y, match = (np.asarray(v) for v in (snapshot.source, snapshot.target, snapshot.match))
+    fields = snapshot.source, snapshot.target, snapshot.match, snapshot.clean
+    x, y, match, clean = map(np.asarray, fields)
     gap = 0.6 * (np.ptp(x, 0).max() + np.ptp(y, 0).max())
     last = np.asarray(snapshot.steps[-1].matched)
-    scenes = [Stage("before", x, y + [gap, 0, 0], last, last == match)]
+    scenes = [Stage("before", x, y + [gap, 0, 0], last, last == match, clean)]
     for number, step in enumerate(snapshot.steps, 1):
-        moved = x @ np.asarray(step.rotation).T + step.translation
+        moved, shape = (c @ np.asarray(step.rotation).T + step.translation for c in (x, clean))
         matched = np.asarray(step.matched)
-        scenes.append(Stage(f"iteration {number}", moved, y, matched, matched == match))
+        scenes.append(Stage(f"iteration {number}", moved, y, matched, matched == match, shape))
     return scenes
 
 
@@ -111,6 +116,11 @@ def match_accuracy(snapshot: PairSnapshot) -> float:
     match, matched = np.asarray(snapshot.match), np.asarray(snapshot.steps[-1].matched)
     inlier = (match >= 0) & (match < len(snapshot.target))
     return float((matched == match)[inlier].mean())
+
+
+def thin(points: np.ndarray, count: int) -> np.ndarray:
+    """Take at most so many of the points (N, 3), evenly over their order."""
+    return points[np.linspace(0, len(points) - 1, min(count, len(points))).astype(int)]
 
 
 def _rounded(values: Tensor, digits: int) -> list:
