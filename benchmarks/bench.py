@@ -469,7 +469,8 @@ def draw(growth: dict[str, list[Row]], exponents: dict[str, Any], path: Path) ->
             label = f"N^{power}" if power > 1 else "N"
             axes.loglog(n, low * (n / left) ** power, ":", color="grey", zorder=0)
             end = min(right, left * (high / low) ** (1 / power))
-            axes.annotate(label, (end, low * (end / left) ** power), ha="right", va="top", color="grey")
+            at = end, low * (end / left) ** power
+            axes.annotate(label, at, ha="right", va="top", color="grey")
         axes.set(xlim=(left, right), ylim=(low, high))
         axes.set(xlabel="points N of either cloud", title=title)
         axes.set_xticks(POINTS, [str(n) for n in POINTS], minor=False)

@@ -110,7 +110,7 @@ def test_a_quaternion_turns_like_its_matrix(generator):
 
 
 def test_the_pose_depends_on_the_clouds_from_the_start():
-    """With torch's default weights it did not, and PCRNet stayed at the identity for 160,000 pairs."""
+    """With torch's default weights it did not: PCRNet stayed at the identity for 160,000 pairs."""
     torch.manual_seed(0)
     network = PCRNetwork()
     clouds = torch.nn.functional.normalize(torch.randn(8, 100, 3), dim=-1)

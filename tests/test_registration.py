@@ -13,6 +13,7 @@ from conftest import shared
 from PIL import Image
 
 import corrmat
+from corrmat import weights
 from corrmat.cli import main
 from corrmat.data.scans import read_scan, write_ply
 from corrmat.data.shapes.dataset import make_shape
@@ -320,3 +321,16 @@ def test_the_page_opens_in_a_browser(pair, tmp_path):
     assert "aligned, confidence" in shown.stdout
     assert not [line for line in shown.stderr.splitlines() if "Uncaught" in line]
     assert 'class="gl-container"' in shown.stdout
+
+
+@pytest.mark.parametrize(
+    ("confidence", "words"),
+    [
+        (0.9, "aligned"),
+        (0.89, "probably aligned: why"),
+        (0.5, "probably aligned: why"),
+        (0.49, "doubtful: why"),
+    ],
+)
+def test_a_verdict_is_a_confidence_in_words(confidence, words):
+    assert weights.verdict(confidence, "why") == words

@@ -243,6 +243,16 @@ def ship_network(
     return path
 
 
+SURE, LIKELY = 0.9, 0.5  # least confidence of the verdicts "aligned" and "probably aligned"
+
+
+def verdict(confidence: float, reason: str) -> str:
+    """Put a confidence into words, with the reason unless they are "aligned"."""
+    if confidence >= SURE:
+        return "aligned"
+    return f"{'probably aligned' if confidence >= LIKELY else 'doubtful'}: {reason}"
+
+
 @dataclass(frozen=True)
 class Calibration:
     """Logistic curves from the scores of a registration to the chance that it is right.

@@ -11,7 +11,8 @@ from rich.progress import track
 from scipy.spatial.transform import Rotation
 
 from corrmat.errors import CorrmatError
-from corrmat.registration.register import MIN_CONFIDENCE, Refine, matrix_lines, register
+from corrmat.registration.register import Refine, matrix_lines, register
+from corrmat.weights import verdict
 
 _SWEEPS = 50  # of averaging; poses settle within ten
 _ANGLE_DEG, _SHARE = 10.0, 0.1  # how far a registration may be off the poses to agree with them
@@ -24,7 +25,7 @@ class ScanPose:
     transform: np.ndarray  # (4, 4) float64, T_target_scan, in the scans' own units
     confidence: float  # of the weakest registration on the surest way to the target
     agree: int  # registrations of this scan that agree with the poses
-    verdict: str  # "aligned", or "doubtful: " and why
+    verdict: str  # as of a `Registration`
 
 
 def register_scans(
@@ -126,10 +127,8 @@ class _PoseGraph:
         transform[:3, 3] = self.images[index] - self.rotations[index] @ self.centres[index]
         confidence, mine = float(self.confidence[index]), self._edges_of(index)
         agree = sum(self._agrees(index, *self._predict(index, edge)) for edge in mine)
-        verdict = "aligned"
-        if confidence < MIN_CONFIDENCE:
-            verdict = f"doubtful: {agree} of {len(mine)} registrations agree"
-        return ScanPose(transform, confidence, agree, verdict)
+        reason = f"{agree} of {len(mine)} registrations agree"
+        return ScanPose(transform, confidence, agree, verdict(confidence, reason))
 
     def _edges_of(self, index: int) -> list[_Edge]:
         return [edge for edge in self.edges if index in (edge.source, edge.target)]

@@ -13,14 +13,13 @@ from corrmat.data.normals import estimate_normals
 from corrmat.errors import CorrmatError
 from corrmat.registration.hypotheses import CLASSICAL, HypothesisGenerator, NetworkHypotheses
 from corrmat.registration.scoring import AlignmentScorer
-from corrmat.weights import Calibration, load_model, shipped_calibration
+from corrmat.weights import Calibration, load_model, shipped_calibration, verdict
 
 Refine = Literal["icp", "none"]
 MODEL_POINTS = 1024  # points of either cloud for the model
 SELECTION_POINTS = 2048  # to select among its hypotheses
 FULL_POINTS = 20_000  # to refine the selected one
 MEDIAN = 0.6  # median distance from the centroid after scaling: a radius of about one
-MIN_CONFIDENCE = 0.5  # of the verdict "aligned"
 MAX_NORMAL = 1.01  # longest given normal
 _LINE = 1e-6  # a cloud that is thinner, relative to its length, is a line
 
@@ -38,7 +37,7 @@ class Registration:
     confidence: float  # in [0, 1]: calibrated chance that the clouds are aligned
     rmse: float  # of aligned source points near a target point, in the clouds' units
     overlap: float  # share of source points near a target point
-    verdict: str  # "aligned", or "doubtful: " and why
+    verdict: str  # "aligned", or "probably aligned: " or "doubtful: " and why
     model: str
     seed: int
     seconds: float
@@ -113,7 +112,7 @@ def register(
         confidence=confidence,
         rmse=rmse / scale,
         overlap=overlap,
-        verdict=_verdict(confidence, overlap),
+        verdict=verdict(confidence, f"{overlap:.0%} of the source lies on the target"),
         model=str(model),
         seed=seed,
         seconds=time.perf_counter() - start,
@@ -253,9 +252,3 @@ def _to_original_units(
     converted = transform.copy()
     converted[:3, 3] = centre_y + transform[:3, 3] / scale - transform[:3, :3] @ centre_x
     return converted
-
-
-def _verdict(confidence: float, overlap: float) -> str:
-    if confidence >= MIN_CONFIDENCE:
-        return "aligned"
-    return f"doubtful: {overlap:.0%} of the source lies on the target"

@@ -12,7 +12,7 @@ from scipy import stats
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG
 from corrmat.reporting.figures import BLUE, GREEN, RED, save
 from corrmat.reporting.tables import markdown_row
-from corrmat.weights import shipped_calibration
+from corrmat.weights import LIKELY, SURE, shipped_calibration
 
 OURS = "corrmat"
 _PROTOCOLS = ("real", "views", "clean", "rooms")  # in the order of the tables
@@ -73,7 +73,7 @@ def networks_table(results: Path) -> str:
 def confidence_table(results: Path) -> str:
     """Build the table of what the confidence promised and how often the clouds were aligned.
 
-    Below it stand the expected calibration error and the share of wrong verdicts "aligned".
+    Below it stand the expected calibration error and the shares of wrong verdicts.
     """
     heads = ["data", "confidence", "pairs", "promised", "aligned"]
     lines = [markdown_row(heads), "|---|---|---|---|---|"]
@@ -93,12 +93,19 @@ def confidence_table(results: Path) -> str:
                 lines.append(markdown_row([data, span, str(inside.sum()), *means]))
     if everything:
         promised, aligned = map(np.concatenate, zip(*everything, strict=True))
-        wrong = ((promised >= 0.5) & ~aligned).mean()
+        calls = {
+            "aligned": promised >= SURE,
+            "probably aligned": (promised >= LIKELY) & (promised < SURE),
+        }
+        shares = [
+            f'{called.mean():.0%} are called "{words}", {(called & ~aligned).mean():.1%} wrongly'
+            for words, called in calls.items()
+        ]
         error = expected_calibration_error(promised, aligned)
         lines += [
             "",
-            f"Expected calibration error over {_BINS} bins: {error:.3f}. Called aligned but not "
-            f"lying on each other: {wrong:.1%} of {len(promised)} pairs.",
+            f"Expected calibration error over {_BINS} bins: {error:.3f}. "
+            f"Of {len(promised)} pairs, {'; '.join(shares)}.",
         ]
     return "\n".join(lines)
 

@@ -69,7 +69,9 @@ def _mark_misprints(
     row: list[str], heads: Sequence[str], identity: str, subset: str, name: str
 ) -> list[str]:
     """Append "(misprint)" to the paper's numbers in `MISPRINTS`."""
-    wrong = {f"paper {arm}" for i, arm, *rest in MISPRINTS if [i, *rest] == [identity, subset, name]}
+    wrong = {
+        f"paper {arm}" for i, arm, *rest in MISPRINTS if [i, *rest] == [identity, subset, name]
+    }
     return [f"{c} (misprint)" if h in wrong else c for c, h in zip(row, heads, strict=True)]
 
 
