@@ -92,9 +92,9 @@ def test_an_arm_at_the_identity_guess_shows_nothing():
 
 
 def test_sooner_counts_the_pairs_to_the_others_best_error():
-    def curve(*values):
+    def curve(*values, every=250.0):
         return [
-            {"pairs_seen": 250.0 * (i + 1), "rotation_error_deg_mean": v}
+            {"pairs_seen": every * (i + 1), "rotation_error_deg_mean": v}
             for i, v in enumerate(values)
         ]
 
@@ -102,6 +102,7 @@ def test_sooner_counts_the_pairs_to_the_others_best_error():
         (curve(9, 3, 2, 1), "confirmed"),
         (curve(9, 8, 3, 1), "confirmed in direction"),
         (curve(9, 8, 7, 6), "contradicted"),
+        (curve(3, 1, every=2000.0), "not shown"),  # nobody looked before the 1,000 pairs were over
     ):
         judged = claims.sooner(
             evidence(drawn(6.0), drawn(0.3), curves=(curve(9, 8, 7, 4), treatment))

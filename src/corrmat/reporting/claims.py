@@ -118,7 +118,7 @@ def less_error(evidence: Evidence) -> Claim:
     ours += f" (p {_p_text(p)}; flips {flips[0]} → {flips[1]})"
     if not learnt:
         identity = f"{evidence.identity_median_deg:g} deg"
-        ours += f"; {record.baseline} stays near the identity guess, {identity}"
+        ours += f"; {record.baseline} errs by at least half of the identity guess, {identity}"
     return Claim(
         f"{record.id}: {record.treatment} registers better than {record.baseline} ({record.title})",
         f"{theirs[0]:.3g} → {theirs[1]:.3g} deg: {paper_ratio:.3g} times" if paper_ratio else "",
@@ -154,11 +154,13 @@ def sooner(evidence: Evidence) -> Claim:
     needed = next((p["pairs_seen"] for p in treatment.curve if p[name] <= goal), math.inf)
     share = needed / baseline.pairs_seen
     verdict: Verdict = "confirmed" if share <= 0.5 else "confirmed in direction"
+    at_once = needed == treatment.curve[0]["pairs_seen"]
     if share >= 1:
-        verdict = "contradicted"
+        verdict = "not shown" if at_once else "contradicted"
     if not evidence.left_identity(evidence.baseline):
         verdict = "not shown"
     reached = "never" if math.isinf(needed) else f"after {needed:,.0f}"
+    reached += ", its first validation" if at_once else ""
     goal_text = f"{goal:.3g} deg in validation, {record.baseline}'s best"
     return Claim(
         f"{record.id}: {record.treatment} converges sooner",

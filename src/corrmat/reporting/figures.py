@@ -131,9 +131,8 @@ def _training_panel(record: Record, name: str, xlabel: str = _PAIRS) -> Panel:
         series.append(
             CurveSeries("identity", GREY, [min(x), max(x)], [factor * guess] * 2, "baseline")
         )
-    log_x = max(lengths, default=1) > 4 * min(
-        lengths, default=1
-    )  # laptop's PCRNet: equal minutes, not equal pairs
+    # Laptop's PCRNet: equal minutes, not equal pairs.
+    log_x = max(lengths, default=1) > 4 * min(lengths, default=1)
     log_y = name not in ("loss", "match_accuracy")
     return Panel(title, xlabel, log_x, log_y, series)
 
