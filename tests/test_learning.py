@@ -57,7 +57,7 @@ def train(name, network, steps, lr, rotation_deg):
         ("RPMNet", RPMNET, 300, 3e-3, 45.0, 0.05, None, 0.5),
         # A feature of PCRNet_corr sees its own point alone (paper section 5.3).
         ("PCRNet_corr", PCRNET, 300, 1e-3, 45.0, 0.5, 0.7, 3.0),
-        ("PCRNet", PCRNET, 500, 1e-3, 45.0, 0.7, None, 15.0),
+        ("PCRNet", PCRNET, 500, 3e-4, 45.0, 0.7, None, 15.0),
         ("Invariant_corr", INVARIANT, 300, 3e-3, 180.0, 0.2, 0.95, 0.5),
     ],
 )
