@@ -12,9 +12,9 @@ from corrmat.reporting.snapshots import PairSnapshot, Stage, stages
 
 Plot = dict[str, object]
 """A plotly figure: `data` and `layout`."""
-QUANTILES = np.linspace(0, 1, 101)
+QUANTILES = np.linspace(0, 1, 51)
 _TRACES = 5  # of a stage
-_MAX_POINTS, _MAX_LINES = 120, 45  # drawn of a cloud, of the matches: the page stays small
+_MAX_POINTS, _MAX_LINES = 90, 36  # drawn of a cloud, of the matches: the page stays small
 
 
 def curves_plot(record: Record) -> Plot:
@@ -38,7 +38,8 @@ def curves_plot(record: Record) -> Plot:
                 label = {"name": series.label, "mode": "lines", "showlegend": False}
                 line["dash"] = "dot" if series.source == "paper" else "dash"
             axes = {"xaxis": f"x{suffix}", "yaxis": f"y{suffix}", "legendgroup": series.arm}
-            data.append(axes | {"x": series.x, "y": series.y, "line": line} | label)
+            x, y = ([float(f"{value:.4g}") for value in values] for values in (series.x, series.y))
+            data.append(axes | {"x": x, "y": y, "line": line} | label)
         for axis, log, text in (("x", panel.log_x, panel.xlabel), ("y", panel.log_y, panel.title)):
             title = {"text": text, "standoff": 4}
             layout[f"{axis}axis{suffix}"] = {"type": "log" if log else "linear", "title": title}
