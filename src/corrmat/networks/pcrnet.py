@@ -33,13 +33,11 @@ class PCRNetwork(nn.Module):
         self.iterations = iterations
         self.embed = PointNet(width)
         sizes = (2 * width, 1024, 1024, 512, 512, 256)
-        hidden = nn.Sequential(
-            *(
-                layer
-                for i, o in zip(sizes, sizes[1:], strict=False)
-                for layer in (nn.Linear(i, o), nn.ReLU())
-            )
-        )
+        hidden = [
+            layer
+            for i, o in zip(sizes, sizes[1:], strict=False)
+            for layer in (nn.Linear(i, o), nn.ReLU())
+        ]
         keep_signal_size(hidden)
         last = nn.Linear(256, 7)
         with torch.no_grad():

@@ -1,6 +1,6 @@
 """Shared MLPs (the same layers for every point) and PointNet."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -64,7 +64,7 @@ class PointNet(nn.Module):
         return F.relu(linear_max(features, widest))
 
 
-def keep_signal_size(layers: nn.Sequential) -> None:
+def keep_signal_size(layers: Iterable[nn.Module]) -> None:
     """Initialise linear layers before a ReLU as He et al. (ICCV 2015).
 
     torch's default shrinks the signal to 0.4 of its size a layer. After ten layers without norms,

@@ -118,7 +118,7 @@ def less_error(evidence: Evidence) -> Claim:
     ours += f" (p {_p_text(p)}; flips {flips[0]} → {flips[1]})"
     if not learnt:
         identity = f"{evidence.identity_median_deg:g} deg"
-        ours += f"; {record.baseline} errs by at least half of the identity guess, {identity}"
+        ours += f"; {record.baseline} errs by at least half of the identity guess's {identity}"
     return Claim(
         f"{record.id}: {record.treatment} registers better than {record.baseline} ({record.title})",
         f"{theirs[0]:.3g} → {theirs[1]:.3g} deg: {paper_ratio:.3g} times" if paper_ratio else "",

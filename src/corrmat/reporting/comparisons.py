@@ -12,7 +12,7 @@ from scipy import stats
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG
 from corrmat.reporting.figures import BLUE, GREEN, RED, save
 from corrmat.reporting.tables import markdown_row
-from corrmat.weights import LIKELY, SURE, shipped_calibration
+from corrmat.weights import shipped_calibration, verdict
 
 OURS = "corrmat"
 _PROTOCOLS = ("real", "views", "clean", "rooms")  # in the order of the tables
@@ -93,14 +93,12 @@ def confidence_table(results: Path) -> str:
                 lines.append(markdown_row([data, span, str(inside.sum()), *means]))
     if everything:
         promised, aligned = map(np.concatenate, zip(*everything, strict=True))
-        calls = {
-            "aligned": promised >= SURE,
-            "probably aligned": (promised >= LIKELY) & (promised < SURE),
-        }
-        shares = [
-            f'{called.mean():.0%} are called "{words}", {(called & ~aligned).mean():.1%} wrongly'
-            for words, called in calls.items()
-        ]
+        verdicts = np.array([verdict(p, "").partition(":")[0] for p in promised])
+        shares = []
+        for words in ("aligned", "probably aligned"):
+            called = verdicts == words
+            wrong = (called & ~aligned).mean()
+            shares.append(f'{called.mean():.0%} are called "{words}", {wrong:.1%} wrongly')
         error = expected_calibration_error(promised, aligned)
         lines += [
             "",

@@ -34,7 +34,6 @@ Source = Literal["arm", "paper", "misprint", "baseline"]
 _STYLES: dict[Source, dict[str, Any]] = {
     "arm": {"linewidth": 1.4},
     "paper": {"linestyle": ":", "linewidth": 1.4},
-    "misprint": {"marker": "X", "linestyle": ""},
     "baseline": {"linestyle": "--", "linewidth": 1.2},
 }
 
@@ -106,24 +105,27 @@ def panels(record: Record) -> list[Panel]:
 def _training_panel(record: Record, name: str, xlabel: str = _PAIRS) -> Panel:
     """Describe the curves of one validation metric (or of the training loss).
 
-    Minutes are the arm's own, spread evenly over its pairs.
+    Args:
+        record: whose.
+        name: of the metric.
+        xlabel: `_PAIRS`, or `_MINUTES`: the arm's own, spread evenly over its pairs.
     """
     title, _, factor = METRICS.get(name, ("training loss, share of its start", "", 1))
     series: list[CurveSeries] = []
     lengths = []
     for arm, colour, result in _arms(record):
         pace = result.train_seconds / 60 / (result.pairs_seen or 1) if xlabel == _MINUTES else 1
-        pairs = [pace * point["pairs_seen"] for point in result.curve]
-        lengths.append(max(pairs, default=1))
+        spent = [pace * point["pairs_seen"] for point in result.curve]
+        lengths.append(max(spent, default=1))
         values = [defined(point.get(name)) for point in result.curve]
-        if pairs and None not in values:
+        if spent and None not in values:
             # The arms' losses have no unit in common.
             unit = 1 / values[0] if name == "loss" and values[0] else factor
             y = [unit * value for value in values if value is not None]
-            series.append(CurveSeries(arm, colour, pairs, y))
+            series.append(CurveSeries(arm, colour, spent, y))
         final = record.paper[arm].get(name) if arm in record.paper else None
-        if pairs and final is not None:
-            ends = [min(pairs[0], pairs[-1] / 2), pairs[-1]]
+        if spent and final is not None:
+            ends = [min(spent[0], spent[-1] / 2), spent[-1]]
             series.append(CurveSeries(arm, colour, ends, [factor * final] * 2, "paper"))
     guess = record.baselines.get("identity", ArmResult({})).get(name)
     if series and guess:

@@ -8,13 +8,13 @@ import numpy as np
 
 from corrmat.reporting.figures import BLUE, GREEN, GREY, RED, arm_colours, grid, panels
 from corrmat.reporting.record import Record
-from corrmat.reporting.snapshots import PairSnapshot, Stage, stages
+from corrmat.reporting.snapshots import PairSnapshot, Stage, stages, thin
 
 Plot = dict[str, object]
 """A plotly figure: `data` and `layout`."""
 QUANTILES = np.linspace(0, 1, 51)
 _TRACES = 5  # of a stage
-_MAX_POINTS, _MAX_LINES = 90, 36  # drawn of a cloud, of the matches: the page stays small
+_MAX_POINTS, _MAX_LINES = 70, 36  # drawn of a cloud, of the matches: the page stays small
 
 
 def curves_plot(record: Record) -> Plot:
@@ -102,17 +102,12 @@ def _stage_traces(stage: Stage) -> list[Plot]:
     """Plot one stage: clouds, right and wrong matches, outliers."""
     outlier, correct = stage.called_outlier, stage.correct
     return [
-        point_trace(_thin(stage.target), "target", BLUE),
-        point_trace(_thin(stage.source), "source", "#000"),
+        point_trace(thin(stage.target, _MAX_POINTS), "target", BLUE),
+        point_trace(thin(stage.source, _MAX_POINTS), "source", "#000"),
         _match_trace(stage, correct & ~outlier, "right matches", GREEN),
         _match_trace(stage, ~correct & ~outlier, "wrong matches", RED),
         point_trace(stage.source[outlier], "called outlier", "#ff7f0e", "circle-open", 6),
     ]
-
-
-def _thin(points: np.ndarray) -> np.ndarray:
-    """Take every so many points."""
-    return points[:: -(-len(points) // _MAX_POINTS)]
 
 
 def point_trace(

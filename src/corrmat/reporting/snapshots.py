@@ -90,7 +90,7 @@ def take_snapshot(
         target=_rounded(batch.target[0, :, :3], 4),
         match=batch.match[0].tolist(),
         steps=steps,
-        clean=np.round(thin(batch.clean[0].numpy().astype(float), _CLEAN_POINTS), 3).tolist(),
+        clean=thin(batch.clean[0].double().numpy().round(3), _CLEAN_POINTS).tolist(),
     )
 
 

@@ -61,18 +61,16 @@ def table(record: Record) -> tuple[list[str], list[list[str]]]:
             for name in names:
                 heading = f"{subset.label}: {METRICS[name][0]}"
                 if row := _row_of(record, heading, name, results):
-                    rows.append(_mark_misprints(row, heads, record.id, subset.label, name))
+                    rows.append(_mark_misprints(record, heads, row, subset.label, name))
     return heads, rows
 
 
 def _mark_misprints(
-    row: list[str], heads: Sequence[str], identity: str, subset: str, name: str
+    record: Record, heads: Sequence[str], row: list[str], subset: str, name: str
 ) -> list[str]:
     """Append "(misprint)" to the paper's numbers in `MISPRINTS`."""
-    wrong = {
-        f"paper {arm}" for i, arm, *rest in MISPRINTS if [i, *rest] == [identity, subset, name]
-    }
-    return [f"{c} (misprint)" if h in wrong else c for c, h in zip(row, heads, strict=True)]
+    wrong = {f"paper {a}" for a in record.paper if (record.id, a, subset, name) in MISPRINTS}
+    return [f"{c} (misprint)" if h in wrong else c for h, c in zip(heads, row, strict=True)]
 
 
 def _subset(result: ArmResult, part: str, index: int) -> ArmResult:
