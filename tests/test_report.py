@@ -88,6 +88,18 @@ def test_the_figure_is_drawn_the_same_twice(tmp_path):
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
+@pytest.mark.parametrize("number", range(1, 10))
+def test_any_number_of_panels_is_drawn(number, tmp_path, monkeypatch):
+    """Arms of different pace add two panels, a sweep two more: eight do not fill three rows."""
+    record = Record.from_json(RECORD)
+    some = figures.panels(record)[:1] * number
+    monkeypatch.setattr(figures, "panels", lambda _: some)
+    drawn = []
+    monkeypatch.setattr(figures, "save", lambda figure, _: drawn.append(len(figure.axes)))
+    figures.draw_curves(record, tmp_path / "curves.png")
+    assert drawn == [number]
+
+
 def test_panels_show_training_bands_or_the_sweep():
     shown = figures.panels(Record.from_json(RECORD))
     assert [panel.title for panel in shown][:2] == [

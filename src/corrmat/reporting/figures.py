@@ -189,7 +189,10 @@ def draw_curves(record: Record, path: Path) -> None:
     figure.suptitle(f"{record.id}  {record.title}  ({record.scale}, {record.data})")
     training = [s for p in all_panels if p.xlabel == _PAIRS for s in p.series]
     ends = [value for series in training for value in (series.x[0], series.x[-1])]
-    for axes, panel in zip(figure.subplots(rows, columns).flat, all_panels, strict=True):
+    places = figure.subplots(rows, columns, squeeze=False).flatten()
+    for axes in places[len(all_panels) :]:
+        axes.remove()
+    for axes, panel in zip(places, all_panels, strict=False):
         if panel.bars:
             _draw_bars(axes, panel.series, record.controls)
             axes.set_xticks(record.bands_deg)
