@@ -107,8 +107,11 @@ def test_the_training_of_the_shipped_weights_is_drawn(tmp_path):
     for before in (0, 300):
         run = {"before": before, "pairs": before + 300, "curve": points, "validation": recalls}
         shipping.add_training(tmp_path, run)
+        recalls = {"real": 0.57, "views": 0.71, "clean": 0.88}
     comparisons.draw_training(tmp_path)
     assert (tmp_path / "register" / "training.png").stat().st_size > 10_000
+    # From 300 to 600 pairs is one doubling.
+    assert "real +7.0, views +1.0, clean -2.0." in comparisons.doubling_summary(tmp_path)
 
 
 def test_fragments_of_a_room_overlap_in_part_and_lie_on_each_other():

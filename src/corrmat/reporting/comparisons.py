@@ -120,15 +120,44 @@ def expected_calibration_error(promised: np.ndarray, happened: np.ndarray) -> fl
     return float(sum(gaps) / len(promised))
 
 
+def doubling_summary(results: Path) -> str:
+    """Say what twice the training pairs would bring, by a line through the ends of the runs."""
+    runs = _training_runs(results)
+    if len(runs) < 2:
+        return "Fewer than two training runs are recorded."
+    gains = []
+    for protocol in _PROTOCOLS:
+        if protocol in runs[0]["validation"]:
+            slope, _ = _recall_line(runs, protocol)
+            gains.append(f"{protocol} {slope:+.1f}")
+    return (
+        f"A straight line through the ends of the {len(runs)} runs, over the logarithm of the pairs, "
+        f"says what twice the pairs bring, in points of recall: {', '.join(gains)}."
+    )
+
+
+def _training_runs(results: Path) -> list[dict]:
+    """Read how the shipped weights were trained, a run an entry; none if nothing is recorded."""
+    path = results / "register" / "training.json"
+    return json.loads(path.read_text()) if path.is_file() else []
+
+
+def _recall_line(runs: list[dict], protocol: str) -> tuple[float, float]:
+    """Fit recall in per cent by a line in log2 of the pairs: slope and intercept."""
+    doublings = np.log2([run["pairs"] for run in runs])
+    slope, intercept = np.polyfit(doublings, [100 * r["validation"][protocol] for r in runs], 1)
+    return float(slope), float(intercept)
+
+
 def draw_training(results: Path) -> None:
     """Draw how the shipped weights were trained: loss, and recall on validation pairs.
 
+    A dotted line is the fit of `doubling_summary`, as far as twice the pairs.
     Nothing is drawn where results/register/training.json is missing.
     """
-    path = results / "register" / "training.json"
-    if not path.is_file():
+    runs = _training_runs(results)
+    if not runs:
         return
-    runs = json.loads(path.read_text())
     figure = Figure(figsize=(8.2, 3), layout="constrained")
     loss, recall = figure.subplots(1, 2)
     for run in runs:
@@ -137,15 +166,19 @@ def draw_training(results: Path) -> None:
     for protocol, colour in zip(_PROTOCOLS, (RED, GREEN, BLUE), strict=False):
         y = [100 * run["validation"][protocol] for run in runs]
         recall.plot([run["pairs"] for run in runs], y, "o-", color=colour, label=protocol)
+        if len(runs) > 1:
+            ends = np.array([runs[0]["pairs"], 2 * runs[-1]["pairs"]])
+            slope, intercept = _recall_line(runs, protocol)
+            recall.plot(ends, slope * np.log2(ends) + intercept, ":", color=colour)
     loss.set(title="training loss", xlabel="pairs seen")
     recall.set(title="within 5 degrees, validation, %", xlabel="pairs seen", xscale="log")
-    recall.set_xticks([run["pairs"] for run in runs])
+    recall.set_xticks([*(run["pairs"] for run in runs), 2 * runs[-1]["pairs"]])
     recall.xaxis.set_minor_locator(NullLocator())
-    recall.legend()
+    recall.legend(loc="center left")
     for axes in (loss, recall):
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.grid(alpha=0.3)
-    save(figure, path.with_suffix(".png"))
+    save(figure, results / "register" / "training.png")
 
 
 def _read_comparisons(results: Path) -> list[dict]:

@@ -12,6 +12,7 @@ from corrmat.reporting.comparisons import (
     comparison_summary,
     comparison_table,
     confidence_table,
+    doubling_summary,
     draw_training,
     networks_table,
 )
@@ -139,6 +140,7 @@ TABLES: tuple[tuple[str, str, Callable[[list[Record], Path], str]], ...] = (
     ("docs/claims.md", "claims", lambda _, results: claims_table(results)),
     ("docs/register.md", "comparison", lambda _, results: comparison_table(results)),
     ("docs/register.md", "networks", lambda _, results: networks_table(results)),
+    ("docs/register.md", "doubling", lambda _, results: doubling_summary(results)),
     ("docs/register.md", "confidence", lambda _, results: confidence_table(results)),
     ("docs/speed.md", "bench", lambda _, results: bench_table(results)),
 )
