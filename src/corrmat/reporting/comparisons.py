@@ -131,8 +131,8 @@ def doubling_summary(results: Path) -> str:
             slope, _ = _recall_line(runs, protocol)
             gains.append(f"{protocol} {slope:+.1f}")
     return (
-        f"A straight line through the ends of the {len(runs)} runs, over the logarithm of the pairs, "
-        f"says what twice the pairs bring, in points of recall: {', '.join(gains)}."
+        f"A straight line through the ends of the {len(runs)} runs, over the logarithm of the "
+        f"pairs, says what twice the pairs bring, in points of recall: {', '.join(gains)}."
     )
 
 
