@@ -45,7 +45,7 @@ weights: .venv/ready  ## train what `corrmat register` ships on the embedded sha
 checkpoints: .venv/ready  ## put the trained arms of SCALE's records into the package: corrmat.load_model("1.2/DCP_corr")
 	$(BIN)/python reproduce/checkpoints.py $(OPTIONS)
 
-protocols: .venv/ready  ## the shipped weights beside the classical pipelines (pip install open3d), into results/register
+protocols: .venv/ready  ## the shipped weights beside the classical pipelines (needs the extra baselines), into results/register
 	$(BIN)/python benchmarks/protocols.py $(if $(ROOT),--root "$(ROOT)")
 
 docs: .venv/ready  ## rewrite the documents' tables, redraw the pictures of docs/ and results/, from results/

@@ -76,7 +76,9 @@ def test_the_command_prints_one_table_and_writes_a_record(pairs, tmp_path, capsy
     rows = comparisons.comparison_table(tmp_path / "results").splitlines()[2:]
     assert [row.split(" | ")[3] for row in rows] == ["icp", "corrmat"]
     confidence = comparisons.confidence_table(tmp_path / "results")
-    assert re.search(r"Of 4 pairs, \d+% are called .aligned., \d+\.\d% wrongly; ", confidence)
+    assert re.search(
+        r"4 pairs of single objects: .*, \d are called .aligned., \d of them wrongly, ", confidence
+    )
 
 
 def test_calibration_intervals_and_paired_test_by_hand():

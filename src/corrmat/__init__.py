@@ -7,13 +7,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from corrmat import methods, metrics
+    from corrmat import losses, methods, metrics
     from corrmat.data.datamodule import RegistrationDataModule
-    from corrmat.data.pairs import PairSettings
+    from corrmat.data.pairs import PairSettings, make_pairs
     from corrmat.errors import CorrmatError
+    from corrmat.registration.pose_graph import ScanPose, register_scans
     from corrmat.registration.register import Registration, register
     from corrmat.types import PairBatch, Prediction
-    from corrmat.weights import load_model, load_reference
+    from corrmat.weights import export_model, load_model, load_reference, shipped_models
 
 __version__ = "0.1.0"
 __all__ = [
@@ -23,11 +24,17 @@ __all__ = [
     "Prediction",
     "Registration",
     "RegistrationDataModule",
+    "ScanPose",
+    "export_model",
     "load_model",
     "load_reference",
+    "losses",
+    "make_pairs",
     "methods",
     "metrics",
     "register",
+    "register_scans",
+    "shipped_models",
 ]
 
 _MODULES = {
@@ -37,9 +44,14 @@ _MODULES = {
     "Prediction": "corrmat.types",
     "RegistrationDataModule": "corrmat.data.datamodule",
     "Registration": "corrmat.registration.register",
+    "ScanPose": "corrmat.registration.pose_graph",
+    "export_model": "corrmat.weights",
     "load_model": "corrmat.weights",
     "load_reference": "corrmat.weights",
+    "make_pairs": "corrmat.data.pairs",
     "register": "corrmat.registration.register",
+    "register_scans": "corrmat.registration.pose_graph",
+    "shipped_models": "corrmat.weights",
 }
 
 

@@ -1,14 +1,15 @@
 """The ledger of claims: what the paper says, what our records say, and a verdict by a fixed rule.
 
-The rule was written down before the records that it judges (docs/claims.md repeats it in words).
+docs/claims.md has the rule in words, and what of it came later than the records.
 """
 
 import json
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import yaml
 
@@ -351,6 +352,12 @@ def _judge(record: Record, results: Path) -> list[Claim]:
     evidence = read_evidence(record, results)
     claims = (judge(evidence) for judge in JUDGED[record.id])
     return [claim for claim in claims if claim is not None]
+
+
+def count_verdicts(records: Sequence[Record], results: Path) -> str:
+    """Say how many of the ledger's verdicts are of each kind."""
+    counts = Counter(claim.verdict for claim in claims_of(records, results))
+    return ", ".join(f"{counts[verdict]} {verdict}" for verdict in get_args(Verdict))
 
 
 def verdicts(record: Record, results: Path) -> str:

@@ -73,39 +73,44 @@ def networks_table(results: Path) -> str:
 def confidence_table(results: Path) -> str:
     """Build the table of what the confidence promised and how often the clouds were aligned.
 
-    Below it stand the expected calibration error and the shares of wrong verdicts.
+    Below it stand the expected calibration error and the shares of wrong verdicts, of single
+    objects and of rooms.
     """
     heads = ["data", "confidence", "pairs", "promised", "aligned"]
     lines = [markdown_row(heads), "|---|---|---|---|---|"]
     everything = []
-    for data in ("shapes", "modelnet40"):
+    for data in ("shapes", "modelnet40", "procedural"):
         records = [r["models"][OURS] for r in _read_comparisons(results) if r["data"] == data]
         if not records:
             continue
         promised = np.concatenate([_confidence(row) for row in records])
         aligned = np.concatenate([_aligned(row) for row in records])
-        everything.append((promised, aligned))
+        everything.append((data, promised, aligned))
         for low, high in itertools.pairwise((0, 0.25, 0.5, 0.75, 1.01)):
             inside = (low <= promised) & (promised < high)
             if inside.any():
                 means = [f"{values[inside].mean():.0%}" for values in (promised, aligned)]
                 span = f"{low:.0%} to {min(high, 1):.0%}"
                 lines.append(markdown_row([data, span, str(inside.sum()), *means]))
-    if everything:
-        promised, aligned = map(np.concatenate, zip(*everything, strict=True))
-        verdicts = np.array([verdict(p, "").partition(":")[0] for p in promised])
-        shares = []
-        for words in ("aligned", "probably aligned"):
-            called = verdicts == words
-            wrong = (called & ~aligned).mean()
-            shares.append(f'{called.mean():.0%} are called "{words}", {wrong:.1%} wrongly')
-        error = expected_calibration_error(promised, aligned)
-        lines += [
-            "",
-            f"Expected calibration error over {_BINS} bins: {error:.3f}. "
-            f"Of {len(promised)} pairs, {'; '.join(shares)}.",
-        ]
+    for rooms, what in ((False, "single objects"), (True, "rooms")):
+        chosen = [row[1:] for row in everything if (row[0] == "procedural") == rooms]
+        if not chosen:
+            continue
+        promised, aligned = map(np.concatenate, zip(*chosen, strict=True))
+        lines += ["", f"{len(promised)} pairs of {what}: {_reliability(promised, aligned)}."]
     return "\n".join(lines)
+
+
+def _reliability(promised: np.ndarray, aligned: np.ndarray) -> str:
+    """Say how far promises (n,) were from what happened, and how often a verdict was wrong."""
+    error = expected_calibration_error(promised, aligned)
+    parts = [f"expected calibration error over {_BINS} bins {error:.3f}"]
+    verdicts = np.array([verdict(p, "").partition(":")[0] for p in promised])
+    for words in ("aligned", "probably aligned"):
+        called = verdicts == words
+        wrong = int((called & ~aligned).sum())
+        parts.append(f'{called.sum()} are called "{words}", {wrong} of them wrongly')
+    return ", ".join(parts)
 
 
 def expected_calibration_error(promised: np.ndarray, happened: np.ndarray) -> float:

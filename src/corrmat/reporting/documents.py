@@ -7,7 +7,7 @@ from pathlib import Path
 
 from corrmat.errors import CorrmatError
 from corrmat.files import replace_bytes, replace_text
-from corrmat.reporting.claims import headline, markdown_claims, read_evidence
+from corrmat.reporting.claims import count_verdicts, headline, markdown_claims, read_evidence
 from corrmat.reporting.comparisons import (
     comparison_summary,
     comparison_table,
@@ -31,7 +31,10 @@ def claims_table(results: Path) -> str:
 
 
 def headline_table(results: Path) -> str:
-    """Build README's table: six experiments, each by the longest training that is recorded."""
+    """Build README's table: six experiments, each by the longest training that is recorded.
+
+    Below it stands how many verdicts of the whole ledger are of each kind.
+    """
     heads = [
         "experiment",
         "METHOD",
@@ -46,7 +49,8 @@ def headline_table(results: Path) -> str:
     for record in longest_records(documented_records(results)):
         if record.id in HEADLINES:
             lines.append(markdown_row(headline(read_evidence(record, results))))
-    return "\n".join(lines)
+    counted = count_verdicts(read_records(results), results)
+    return "\n".join([*lines, "", f"All verdicts of the [ledger](docs/claims.md): {counted}."])
 
 
 def rates_table(results: Path) -> str:
@@ -100,7 +104,7 @@ def bench_table(results: Path) -> str:
         f"memory with N^{by['peak_mb']} (from N = 4096 on, where no matrix is whole)."
         for what, by in bench["exponents"].items()
     ]
-    lines += ["", "Minutes of training an arm of a laptop recipe, alone on the machine:", ""]
+    lines += ["", "Minutes of training an arm at laptop scale, estimated from some steps:", ""]
     for recipe, arms in bench["recipes"].items():
         lines.append(f"- {recipe}: " + ", ".join(f"{arm} {m}" for arm, m in arms.items()))
     machine = f"{bench['threads']} threads ({bench['instructions']}), torch {bench['torch']}"

@@ -33,7 +33,7 @@ class PairErrors:
     @property
     def median_deg(self) -> float:
         """The median rotation error, without its interval."""
-        return float(np.median(self.rotation_deg))
+        return float(_median(self.rotation_deg))
 
     def of_band(self, band: int) -> "PairErrors":
         """Return the pairs of one rotation band."""
@@ -100,7 +100,8 @@ def p_of_equal_errors(one: PairErrors, other: PairErrors) -> float:
 
 
 def _median(values: np.ndarray) -> np.ndarray:
-    return np.median(values, axis=-1)
+    """Compute torch's median, of an even number of values the lower middle one: as in records."""
+    return np.quantile(values, 0.5, axis=-1, method="lower")
 
 
 def _bootstrap(samples: Sequence[np.ndarray], statistic: Callable[..., np.ndarray]) -> Estimate:

@@ -133,7 +133,7 @@ def markdown_summary(records: Sequence[Record]) -> str:
             lines.append(markdown_row(cells))
         cells = _arrows(same[0], list(same[0].paper.values()))
         if any(cells):
-            start = [f"{identity} {same[0].family}, paper", "ModelNet40"]
+            start = [f"{identity} {same[0].family}, as printed", "ModelNet40"]
             lines.append(markdown_row([*start, *cells, ""]))
     return "\n".join(lines)
 
