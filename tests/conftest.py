@@ -12,6 +12,8 @@ ROOT = Path(__file__).resolve().parents[1]
 SHARED = Path(os.environ.get("CORRMAT_SHARED", ROOT.parent / "shared"))
 
 torch.set_num_threads(1)  # tensors here are tiny, and a second thread only waits
+os.environ["WANDB_MODE"] = "disabled"
+os.environ["no_proxy"] = "127.0.0.1,localhost"  # the tests' own servers
 
 
 def shared(*parts: str) -> Path:
@@ -34,9 +36,14 @@ def state_of(arrays: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     return {k.removeprefix("state/"): v for k, v in arrays.items() if k.startswith("state/")}
 
 
+@pytest.fixture(autouse=True, scope="session")
+def _no_cache_of_the_user(tmp_path_factory):
+    """Fixtures of a module come before those of a test."""
+    os.environ["CORRMAT_CACHE"] = str(tmp_path_factory.mktemp("cache"))
+
+
 @pytest.fixture(autouse=True)
 def _quiet_and_offline(monkeypatch, tmp_path):
-    monkeypatch.setenv("WANDB_MODE", "disabled")
     monkeypatch.setenv("CORRMAT_CACHE", str(tmp_path / "cache"))
     console.print_messages(0)
 

@@ -110,6 +110,32 @@ def test_sooner_counts_the_pairs_to_the_others_best_error():
         assert judged.verdict == verdict
 
 
+def test_a_curve_with_errors_that_are_no_numbers_or_without_a_point():
+    """NaN counts as the worst error, wherever it stands; no validation at all settles nothing."""
+    nan = float("nan")
+    for order in ((nan, 3.0, 2.0), (3.0, nan, 2.0), (3.0, 2.0, nan)):
+        values = [
+            {"pairs_seen": 250.0 * i, "rotation_error_deg_mean": v} for i, v in enumerate(order)
+        ]
+        faster = [{"pairs_seen": 100.0, "rotation_error_deg_mean": 1.0}]
+        seen = evidence(drawn(6.0), drawn(0.3), curves=(values, faster))
+        assert claims.sooner(seen).verdict == "confirmed"
+        seen.record.controls.append("DCP_high_rate")
+        seen.record.arms["DCP_high_rate"] = ArmResult({}, curve=values)
+        seen.errors["DCP_high_rate"] = drawn(3.0)
+        assert claims.unstable_at_high_rates(seen).verdict == "confirmed"
+    assert claims.sooner(evidence(drawn(6.0), drawn(0.3))) is None
+
+
+def test_the_verdicts_are_counted(monkeypatch):
+    claim = claims.Claim("", "", "", "", "confirmed")
+    other = dataclasses.replace(claim, verdict="not shown")
+    monkeypatch.setattr(claims, "claims_of", lambda *_: [claim, other, claim])
+    assert claims.count_verdicts([], None) == (
+        "2 confirmed, 0 confirmed in direction, 1 not shown, 0 contradicted"
+    )
+
+
 def test_growth_over_bands():
     edges = (0, 30, 60)
     flat = errors(

@@ -62,6 +62,10 @@ def test_help_of_a_command_lists_typed_settings(capsys):
         (["--data.categories", "[sofa, rocket]"], "unknown category 'rocket'"),
         (["--data.data", "modelnet40"], "ROOT="),
         (["--data.data", "modelnet40", "--data.root", "nowhere"], "no ModelNet40 in nowhere"),
+        (["--data.name", "../else"], "is not the name of one folder"),
+        (["--network.edge_channels", "[0, 0]"], "channels 0 is not positive"),
+        (["--trainer.limit_val_batches", "0"], "limit_val_batches 0 leaves nothing to do"),
+        (["--trainer.val_check_interval", "0"], "val_check_interval 0 leaves nothing to do"),
         (["--arm", "ICP"], "unknown arm 'ICP'"),
         (["--config", "nowhere.yaml"], "no recipe nowhere.yaml"),
     ],
@@ -113,6 +117,7 @@ def test_corrmat_alone_says_what_it_can_do(capsys):
         ),
         (["data", "modelnet40", "--root", "file/x"], "file"),
         (["register", "a.ply", "b.ply", "-o", "moved.xyz"], "written as PLY"),
+        (["register", "a.ply", "b.ply", "--json", "."], "is a folder, not a file"),
     ],
 )
 def test_what_would_do_nothing_or_fail_late_is_said_at_once(

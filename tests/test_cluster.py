@@ -45,7 +45,7 @@ def test_arms_trained_by_two_workers_one_of_them_killed_give_the_same_record(tmp
         cluster.train_all(CONFIGS, "smoke", overrides, tmp_path / "runs", "none")
     finally:
         ray.shutdown()
-    killer.join(timeout=1)
+    killer.join(timeout=30)
     assert killed
     said = capfd.readouterr().out
     assert "1.1 DCP: trained" in said

@@ -63,6 +63,13 @@ def test_shapenets_layout_and_a_flat_folder_are_split_by_a_hash(tmp_path):
         assert 0 < len(test[1]) < len(train[1])
 
 
+def test_a_folder_called_train_may_hold_trains(tmp_path):
+    write_meshes(tmp_path, [f"{c}/{i}.off" for c in ("bus", "car", "train") for i in range(20)])
+    train, test = (folder.find_shapes(tmp_path, split) for split in ("train", "test"))
+    assert train[0] == test[0] == ("bus", "car", "train")
+    assert len(train[1]) + len(test[1]) == 60
+
+
 def test_an_interrupted_build_continues_with_the_next_shard(modelnet, monkeypatch, tmp_path):
     monkeypatch.setattr(build, "SHARD", 4)
     write, numbers = build.write_shard, []

@@ -62,10 +62,11 @@ def test_the_same_generator_gives_the_same_motions(generator):
 
 def test_matches_that_no_rigid_motion_explains_give_none(generator):
     x = torch.rand(30, 3, generator=generator)
-    rotation, shift, score = ransac(x, 10 * x, torch.ones(30), 0.01, generator=generator)
-    assert rotation.shape == (0, 3, 3)
-    assert shift.shape == (0, 3)
-    assert score.shape == (0,)
+    for y, weight in ((10 * x, torch.ones(30)), (x, torch.zeros(30))):
+        rotation, shift, score = ransac(x, y, weight, 0.01, generator=generator)
+        assert rotation.shape == (0, 3, 3)
+        assert shift.shape == (0, 3)
+        assert score.shape == (0,)
 
 
 def test_points_on_a_line_are_laid_on_each_other(generator):

@@ -1,6 +1,7 @@
 """`corrmat register`: two clouds of anybody's."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -104,6 +105,18 @@ def test_detail_far_from_the_origin_is_not_lost():
     assert np.linalg.norm(moved - target, axis=1).max() < 1e-3
 
 
+@pytest.mark.parametrize("far", [1e4, 1e9])
+def test_a_stray_point_far_away_changes_nothing(pair, far):
+    """One of them would shift the centroid and the scale of all others."""
+    _, source, target, _ = pair
+    without = corrmat.register(source, target)
+    stray = source.mean(0) + [0, 0, far * np.ptp(source)]
+    result = corrmat.register(np.vstack([stray, source]), target)
+    assert (result.transform == without.transform).all()
+    assert result.verdict == "aligned"
+    assert (result.matches == without.matches + [1, 0]).all()
+
+
 def registration_rotation(rng):
     q, r = np.linalg.qr(rng.normal(size=(3, 3)))
     q = q * np.sign(np.diag(r))
@@ -122,6 +135,7 @@ LINE = np.arange(50.0)[:, None] * np.array([1.0, 2.0, 3.0])
         (np.vstack([[[np.inf, 0, 0]], GRID]), "the first is row 0"),
         (np.ones((9, 3)), "all points are equal; the rotation is not determined"),
         (np.ones((9, 3)) * 1e7 + 0.1, "all points are equal; the rotation is not determined"),
+        (1e170 * GRID, "coordinates are too large"),
         (LINE, "all points lie on one line; the rotation is not determined"),
         (LINE + 1e6, "all points lie on one line; the rotation is not determined"),
         (GRID[:, :2], r"array of shape \(64, 2\)"),
@@ -141,7 +155,8 @@ def test_clouds_that_determine_nothing_are_refused(cloud, message):
     [
         ({"model": "nobody"}, "no model 'nobody'"),
         ({"refine": "much"}, "refine = 'much'"),
-        ({"seed": -1}, "seed = -1 is negative"),
+        ({"seed": -1}, "seed = -1 is not between"),
+        ({"seed": 2**64}, "is not between"),
     ],
 )
 def test_unknown_options_are_refused(options, message):
@@ -230,6 +245,40 @@ def test_bad_input_is_one_line_and_code_2(words, message, tmp_path, monkeypatch,
     assert message in said
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["a.ply", "b.ply", "-o", "a.ply"],
+        ["a.ply", "b.ply", "-o", "./folder/../b.ply"],
+        ["a.ply", "c.ply", "b.ply", "-o", "."],
+        ["c.obj", "a.ply", "c.ply", "-o", "."],
+    ],
+)
+def test_no_scan_is_overwritten(words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder").mkdir()
+    for name in ("a.ply", "b.ply", "c.ply"):
+        write_ply(tmp_path / name, GRID)
+    before = {path: path.read_bytes() for path in tmp_path.glob("*.ply")}
+    assert main(["register", *words, "--model", "icp"]) == 2
+    assert "is one of the scans" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in tmp_path.glob("*.ply")} == before
+
+
+def test_results_go_through_links_and_into_pipes(pair, tmp_path):
+    folder = pair[0]
+    scans = [str(folder / "source.ply"), str(folder / "target.ply"), "--model", "icp"]
+    (tmp_path / "link.json").symlink_to(tmp_path / "real.json")
+    assert main(["register", *scans, "--json", str(tmp_path / "link.json")]) == 0
+    assert (tmp_path / "link.json").is_symlink()
+    assert json.loads((tmp_path / "real.json").read_text())["model"] == "icp"
+    os.mkfifo(tmp_path / "pipe")
+    reader = subprocess.Popen(["cat", str(tmp_path / "pipe")], stdout=subprocess.PIPE)
+    assert main(["register", *scans, "--json", str(tmp_path / "pipe")]) == 0
+    assert json.loads(reader.communicate()[0])["model"] == "icp"
+    assert not (tmp_path / "pipe").is_file()
+
+
 def test_a_checkpoint_that_could_run_code_is_refused(tmp_path):
     """A pickle that would write a file when loaded: it is not, and one line says why."""
     path = tmp_path / "model.pth"
@@ -254,6 +303,17 @@ def test_a_model_trained_anew_is_read_anew(tmp_path, monkeypatch):
     assert registration._load_network(str(path)) == "second training"
 
 
+def test_a_folder_exported_anew_is_read_anew(tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        registration, "load_model", lambda model: (Path(model) / "model.safetensors").read_text()
+    )
+    monkeypatch.setattr(registration, "NetworkHypotheses", lambda content: content)
+    (tmp_path / "model.safetensors").write_text("first")
+    assert registration._load_network(str(tmp_path)) == "first"
+    (tmp_path / "model.safetensors").write_text("second training")
+    assert registration._load_network(str(tmp_path)) == "second training"
+
+
 def test_a_checkpoint_of_another_network_names_what_does_not_fit(tmp_path):
     path = tmp_path / "model.pth"
     torch.save({"layer.weight": torch.zeros(3)}, path)
@@ -261,6 +321,12 @@ def test_a_checkpoint_of_another_network_names_what_does_not_fit(tmp_path):
         load_model(path)
     torch.save({"emb_nn.conv1.weight": torch.zeros(64, 6, 1, 1)}, path)
     with pytest.raises(CorrmatError, match="emb_nn.conv5.weight is missing"):
+        load_model(path)
+    torch.save({"emb_nn.conv1.weight": torch.zeros(64)}, path)
+    with pytest.raises(CorrmatError, match="none of DCP, RPMNet"):
+        load_model(path)
+    torch.save({"method": "DCPCorr", "state_dict": {"network.a": torch.zeros(3)}}, path)
+    with pytest.raises(CorrmatError, match="another version of corrmat"):
         load_model(path)
 
 

@@ -17,7 +17,7 @@ from corrmat.cli import main
 from corrmat.errors import CorrmatError
 from corrmat.training import experiment
 
-STEPS = ("--trainer.max_steps", "20")
+STEPS = ("--trainer.max_steps", "60")  # long enough to be killed in between
 
 
 def command(*words):
@@ -88,8 +88,9 @@ def test_kill_9_at_any_moment(tmp_path, whole):
     folder, config = tmp_path / "runs/smoke/shapes/1.1/DCP_corr", ROOT / "configs/exp/1.1.yaml"
     for kills in range(40):
         process = start(tmp_path, "fit", "--config", str(config), "--arm", "DCP_corr", *STEPS)
+        process.stdout.readline()  # imports take as long as the machine is slow
         try:
-            process.communicate(timeout=4 + kills / 4)
+            process.communicate(timeout=kills / 4)
             break
         except subprocess.TimeoutExpired:
             process.kill()

@@ -70,6 +70,14 @@ def test_a_table_may_begin_with_the_names_of_its_columns(tmp_path):
     assert read_scan(path).tolist() == [[1, 2, 3], [4, 5, 6]]
 
 
+@pytest.mark.parametrize("header", ["id,x,y,z", "label x y z", '"n","X","Y","Z"', "//N X Y Z"])
+def test_the_names_of_columns_say_which_are_the_coordinates(tmp_path, header):
+    separator = "," if "," in header else " "
+    rows = [separator.join(["7", *map(repr, map(float, row))]) for row in POINTS]
+    (tmp_path / "table.csv").write_text("\n".join([header, *rows]))
+    assert np.abs(read_scan(tmp_path / "table.csv") - POINTS).max() < 1e-12
+
+
 def test_an_array_that_lies_on_its_side_is_not_three_points(tmp_path):
     np.save(tmp_path / "side.npy", POINTS.T)
     with pytest.raises(CorrmatError, match="transpose it"):
@@ -91,6 +99,7 @@ def test_a_ply_keeps_millimetres_at_ten_thousand_kilometres(tmp_path):
         ("empty.ply", b"", "is empty"),
         ("empty.xyz", b"\n\n", "holds no points"),
         ("words.txt", b"one two three\n", "cannot be read as TXT"),
+        ("german.txt", b"1,5 2,5 3,5\n2,0 1,0 0,5\n", "need a decimal point"),
         ("short.txt", b"1 2 3\n4 5\n", "row 2 holds 2 numbers"),
         ("words.csv", b"x,y\nz,u\n", "row 1 holds 2 numbers"),
         ("noise.npy", b"\x93NUMPY nonsense", "cannot be read as NPY"),

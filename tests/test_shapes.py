@@ -55,6 +55,9 @@ def test_the_cache_is_written_whole_and_a_damaged_shard_is_made_again(monkeypatc
     assert first.stat().st_mtime_ns == stamps[0]
     second.write_bytes(second.read_bytes()[:1000])
     np.testing.assert_array_equal(shapes.load("test").rows[:], whole)
+    (index,) = clouds.cache_folder().glob("*/index.json")
+    index.write_text(index.read_text()[:20])
+    np.testing.assert_array_equal(shapes.load("test").rows[:], whole)
 
 
 def test_what_stops_halfway_leaves_whole_shards_and_goes_on(monkeypatch):

@@ -196,10 +196,22 @@ def _compare(options: Namespace) -> int:
 
 def _register(options: Namespace) -> int:
     """Register one file, or several, onto another."""
-    for path in (options.output, options.json, options.html, options.gif):
-        if path is not None and not path.parent.is_dir():
+    several = len(options.source) > 1
+    files = [options.json, options.html, options.gif, *([] if several else [options.output])]
+    for path in [path for path in files if path is not None]:
+        if path.is_dir():
+            raise CorrmatError(f"{path} is a folder, not a file to write")
+        if not path.parent.is_dir():
             raise CorrmatError(f"no folder {path.parent} to write {path.name} into")
-    return (_register_pair if len(options.source) == 1 else _register_several)(options)
+        _keep_scans(options, path)
+    return (_register_several if several else _register_pair)(options)
+
+
+def _keep_scans(options: Namespace, written: Path) -> None:
+    """Refuse to overwrite one of the scans."""
+    for scan in (*options.source, options.target):
+        if scan.resolve() == written.resolve():
+            raise CorrmatError(f"{written} is one of the scans, and would be overwritten")
 
 
 def _register_pair(options: Namespace) -> int:
@@ -249,6 +261,8 @@ def _register_several(options: Namespace) -> int:
     names = [path.with_suffix(".ply").name for path in options.source]
     if options.output is not None and len(set(names)) < len(names):
         raise CorrmatError(f"two scans would both be written to {options.output}: rename one")
+    for name in names if options.output is not None else []:
+        _keep_scans(options, options.output / name)
     from corrmat.data.scans import read_scan, write_ply
     from corrmat.files import replace_text
 

@@ -1,5 +1,6 @@
 """Atomic writes: a reader never sees half a file."""
 
+import os
 import tempfile
 from pathlib import Path
 
@@ -14,10 +15,16 @@ def replace_text(path: Path, text: str) -> None:
 def replace_bytes(path: Path, content: bytes | memoryview) -> None:
     """Write bytes to a temporary file beside `path`, then rename it into place.
 
+    A link stays one: what it points to is replaced. A pipe or device is written to.
+
     Raises:
         OSError: the file cannot be written; the temporary file is removed.
     """
-    partial = path.with_name(path.name + ".partial")
+    path = path.resolve()
+    if path.exists() and not path.is_file():
+        path.write_bytes(content)
+        return
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
         partial.write_bytes(content)
         partial.replace(path)

@@ -195,7 +195,7 @@ def _download(repository: str) -> Path:
     try:
         return Path(hub.hf_hub_download(repository, _MODEL_FILE))
     except Exception as error:  # no network, no such repository, a name that is none
-        reason = str(error).strip().splitlines()[0]
+        reason = f"{type(error).__name__}: {error}".splitlines()[0]
         raise CorrmatError(f"hf:{repository} cannot be downloaded: {reason}") from error
 
 
@@ -330,8 +330,11 @@ def checkpoint_network(path: Path) -> tuple[str, dict[str, Any], nn.Module]:
     method = cast("str", content.get("method"))
     if method not in classes:
         raise CorrmatError(f"{path} is of method {method!r}; methods: {', '.join(classes)}")
-    hparams = content["hyper_parameters"]["network"]
-    network = classes[method].network_type(**hparams)
+    try:
+        hparams = content["hyper_parameters"]["network"]
+        network = classes[method].network_type(**hparams)
+    except (KeyError, TypeError, ValueError) as error:
+        raise CorrmatError(f"{path} is of another version of corrmat ({error!r})") from error
     state = {
         name.removeprefix("network."): value
         for name, value in _tensors(path, content).items()
@@ -347,7 +350,7 @@ def _kind_of(path: Path, state: State) -> str:
     if "feature_model.conv1.weight" in state:
         return "pcrnet"
     first = state.get("emb_nn.conv1.weight")
-    if first is not None:
+    if first is not None and first.ndim > 1:
         return "dcp" if first.shape[1] == 6 else "pcrnet_corr"
     names = ", ".join(sorted(state)[:4])
     raise CorrmatError(

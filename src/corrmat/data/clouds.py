@@ -189,7 +189,11 @@ def open_shards(folder: Path) -> CloudSet | None:
     """
     if not (folder / _INDEX).is_file():
         return None
-    index = json.loads((folder / _INDEX).read_text())
+    try:
+        index = json.loads((folder / _INDEX).read_text())
+    except ValueError:  # cut short: it is made again from the shards
+        (folder / _INDEX).unlink()
+        return None
     damaged = [
         n for n, about in enumerate(index["shards"]) if _crc(_shard(folder, n)) != about["crc32"]
     ]

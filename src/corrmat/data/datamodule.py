@@ -258,7 +258,13 @@ class RegistrationDataModule(L.LightningDataModule):
 
 
 def data_name(data: str, root: str | None, name: str | None) -> str:
-    """Return the folder name of a data set in results/: `name`, or the folder's, or `data`."""
+    """Return the folder name of a data set in results/: `name`, or the folder's, or `data`.
+
+    Raises:
+        CorrmatError: `name` is no plain name.
+    """
+    if name is not None and (name != Path(name).name or not name):
+        raise CorrmatError(f"--data.name {name!r} is not the name of one folder")
     return name or (Path(root).resolve().name if data == "folder" and root else data)
 
 

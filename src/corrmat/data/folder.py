@@ -82,7 +82,8 @@ def find_shapes(root: Path, split: str) -> tuple[tuple[str, ...], list[ShapeFile
     """Find the categories of a folder and the files of a split, in the order of their paths."""
     paths = sorted(p for p in root.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
     relative = [path.relative_to(root) for path in paths]
-    by_folder = any(_split_folder(path) for path in relative)
+    # Both must be there: a folder "train" alone is a category, of trains.
+    by_folder = {"train", "test"} <= {_split_folder(path) for path in relative}
     categories = [
         path.parts[0] if len(path.parts) > 1 else root.resolve().name for path in relative
     ]

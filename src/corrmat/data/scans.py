@@ -3,6 +3,7 @@
 Each reader is imported on first use: together they take longer than a registration.
 """
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 MESHES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
 CLOUDS = (".pcd", ".xyz", ".txt", ".csv", ".npy", ".npz")
 SAMPLES = 20_000  # points taken of a mesh's surface
+_DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+").fullmatch
 
 
 def read_scan(path: Path, seed: int = 0) -> np.ndarray:
@@ -163,17 +165,31 @@ def _numpy(path: Path, seed: int) -> np.ndarray:
 
 
 def _text(path: Path, seed: int) -> np.ndarray:
-    """Read the first three columns of a text file; comments and a header are skipped."""
-    lines = path.read_text("utf-8-sig").replace(",", " ").splitlines()
-    rows = [line.split() for line in lines if line.strip() and not line.lstrip().startswith("#")]
+    """Read the columns x, y and z of a text file, by its header or else the first three.
+
+    Comments are skipped.
+    """
+    lines = [
+        line
+        for line in path.read_text("utf-8-sig").splitlines()
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    if lines and len(lines[-1].split()) > 1 and all(map(_DECIMAL_COMMA, lines[-1].split())):
+        raise CorrmatError(f"{path}: numbers like 1,5 need a decimal point")
+    rows = [line.replace(",", " ").split() for line in lines]
     if rows and len(rows[0]) == 1 and rows[0][0].isdigit():  # the number of points, in XYZ files
         rows = rows[1:]
+    columns = [0, 1, 2]
     if len(rows) > 1 and not any(map(_is_number, rows[0])):  # a header
+        names = [word.strip("\"'/").lower() for word in rows[0]]
+        if {"x", "y", "z"} <= set(names):
+            columns = [names.index(axis) for axis in "xyz"]
         rows = rows[1:]
-    short = next((i for i, row in enumerate(rows) if len(row) < 3), None)
+    short = next((i for i, row in enumerate(rows) if len(row) <= max(columns)), None)
     if short is not None:
-        raise CorrmatError(f"{path}: row {short + 1} holds {len(rows[short])} numbers, not 3")
-    return np.array([row[:3] for row in rows], np.float64).reshape(-1, 3)
+        count = max(columns) + 1
+        raise CorrmatError(f"{path}: row {short + 1} holds {len(rows[short])} numbers, not {count}")
+    return np.array([[row[c] for c in columns] for row in rows], np.float64).reshape(-1, 3)
 
 
 def _is_number(word: str) -> bool:

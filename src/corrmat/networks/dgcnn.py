@@ -22,7 +22,7 @@ class DGCNN(nn.Module):
         self, width: int = 512, channels: tuple[int, ...] = (64, 64, 128, 256), k: int = 20
     ) -> None:
         super().__init__()
-        require_positive(k=k, width=width)
+        require_positive(k=k, width=width, channels=min(channels, default=0))
         self.k = k
         self.edge = nn.ModuleList(
             EdgeConvolution(i, o) for i, o in zip((6, *channels[:-1]), channels, strict=True)

@@ -43,9 +43,11 @@ def ransac(
 
     Returns:
         Rotations (T, 3, 3), translations (T, 3) and scores (T,), best first; T = 0 if no triple
-        of matches is rigid.
+        of matches is rigid, or no match has a weight.
     """
     x, y, weight = x.double(), y.double(), weight.double()
+    if not (weight > 0).any():
+        return x.new_empty(0, 3, 3), x.new_empty(0, 3), x.new_empty(0)
     triple = torch.multinomial(weight, 3 * draws, replacement=True, generator=generator).view(-1, 3)
     sides_x, sides_y = _side_lengths(x[triple]), _side_lengths(y[triple])
     rigid_enough = (sides_x - sides_y).abs().amax(1) < inlier_threshold

@@ -21,6 +21,7 @@ SELECTION_POINTS = 2048  # to select among its hypotheses
 FULL_POINTS = 20_000  # to refine the selected one
 MEDIAN = 0.6  # median distance from the centroid after scaling: a radius of about one
 MAX_NORMAL = 1.01  # longest given normal
+FAR = 30.0  # median distances from the middle: a point beyond is a stray one and left out
 _LINE = 1e-6  # a cloud that is thinner, relative to its length, is a line
 
 
@@ -59,8 +60,9 @@ def register(
 ) -> Registration:
     """Find the rigid transform that takes the source onto the target.
 
-    The clouds may be in any units, overlap in part, share no point, and have outliers. The same
-    points in any order, with the same seed, give the same matrix.
+    The clouds may be in any units, overlap in part, share no point, and have outliers. Stray
+    points, more than thirty times as far out as half of the cloud, are left out. The same points
+    in any order, with the same seed, give the same matrix.
 
     Args:
         source: (N, 3), or (N, 6) with unit normals.
@@ -79,8 +81,8 @@ def register(
     """
     if refine not in ("icp", "none"):
         raise CorrmatError(f"refine = {refine!r}; choices: icp, none")
-    if seed < 0:
-        raise CorrmatError(f"seed = {seed} is negative")
+    if not 0 <= seed < 2**63:
+        raise CorrmatError(f"seed = {seed} is not between 0 and 2^63")
     generate: HypothesisGenerator = CLASSICAL.get(str(model)) or _load_network(str(model))
     start = time.perf_counter()
     x, y = Cloud.of(source, "source", seed), Cloud.of(target, "target", seed)
@@ -159,6 +161,14 @@ class Cloud:
         size = min(FULL_POINTS, len(rank))
         few = np.argpartition(rank, size)[:size] if len(rank) > size else np.arange(size)
         rows = few[np.argsort(rank[few])]
+        with np.errstate(over="ignore"):
+            offset = values[rows, :3] - np.median(values[rows, :3], axis=0)
+            distance = np.linalg.norm(offset, axis=1)
+        typical = np.median(distance)
+        if not np.isfinite(typical):
+            raise CorrmatError(f"{name}: coordinates are too large to compute distances")
+        if typical > 0:
+            rows = rows[distance <= FAR * typical]
         checked = cls(rows, values[rows])
         length, breadth, _ = np.linalg.svd(checked.centred, compute_uv=False)[:3]
         noise = 1e-12 * np.abs(checked.values[:, :3]).max() * np.sqrt(len(rows))
@@ -202,6 +212,7 @@ def _calibration() -> Calibration:
 def _load_network(model: str) -> NetworkHypotheses:
     """Load a model, kept in memory until its file changes."""
     path = Path(model)
+    path = path / "model.safetensors" if path.is_dir() else path  # what `corrmat export` wrote
     stat = path.stat() if path.is_file() else None
     return _cached_network(model, stat and (str(path.resolve()), stat.st_mtime_ns, stat.st_size))
 

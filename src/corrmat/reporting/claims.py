@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
+import numpy as np
 import yaml
 
 from corrmat.reporting.intervals import (
@@ -147,11 +148,14 @@ def headline(evidence: Evidence) -> list[str]:
     ]
 
 
-def sooner(evidence: Evidence) -> Claim:
+def sooner(evidence: Evidence) -> Claim | None:
     """METHOD_corr reaches METHOD's final error after fewer pairs."""
     record, name = evidence.record, "rotation_error_deg_mean"
     baseline, treatment = (record.arms[arm] for arm in record.compared)
-    goal = min(point[name] for point in baseline.curve)
+    if not (baseline.curve and treatment.curve):
+        return None
+    # An error that is not a number is the worst there is.
+    goal = min(np.nan_to_num(point[name], nan=math.inf) for point in baseline.curve)
     needed = next((p["pairs_seen"] for p in treatment.curve if p[name] <= goal), math.inf)
     share = needed / baseline.pairs_seen
     verdict: Verdict = "confirmed" if share <= 0.5 else "confirmed in direction"
@@ -236,7 +240,8 @@ def unstable_at_high_rates(evidence: Evidence) -> Claim | None:
     if control is None:
         return None
     ratio = ratio_of_medians(evidence.baseline, evidence.errors[control])
-    worst = max(point["rotation_error_deg_mean"] for point in evidence.record.arms[control].curve)
+    curve = [p["rotation_error_deg_mean"] for p in evidence.record.arms[control].curve]
+    worst = float(np.max(curve, initial=0.0))  # NaN if one of them is
     verdict: Verdict = "contradicted" if ratio.low > 1 else "not shown"
     if ratio.high < 1 or not math.isfinite(worst):
         verdict = "confirmed"
@@ -272,10 +277,12 @@ def _high_rate_control(record: Record) -> str | None:
     return next((c for c in record.controls if c.endswith("high_rate")), None)
 
 
-def below_seventy_per_cent(evidence: Evidence) -> Claim:
+def below_seventy_per_cent(evidence: Evidence) -> Claim | None:
     """PCRNet_corr "could not achieve" 70 % of correct matches on 1024 points."""
     share, record = match_accuracy(evidence.treatment), evidence.record
     curve = [point["match_accuracy"] for point in record.arms[record.treatment].curve]
+    if not curve:
+        return None
     gain = curve[-1] - curve[-1 - len(curve) // 4]
     verdict: Verdict = "contradicted" if share.low > MOST_MATCHES else "not shown"
     if share.high < MOST_MATCHES and gain < STILL_LEARNING:

@@ -168,6 +168,8 @@ def rewrite_documents(results: Path, root: Path) -> int:
     Raises:
         CorrmatError: a document, or a mark in it, is missing.
     """
+    for page, mark, _ in TABLES:
+        _split_at_marks(root / page, mark)
     records = documented_records(results)
     for record in records:
         draw_record(results / record.place)
@@ -188,6 +190,16 @@ def replace_between_marks(path: Path, name: str, content: str) -> None:
     Raises:
         CorrmatError: the file or the marks are missing.
     """
+    before, after = _split_at_marks(path, name)
+    replace_text(path, f"{before}\n{content}\n{after}")
+
+
+def _split_at_marks(path: Path, name: str) -> tuple[str, str]:
+    """Return a file's text up to `<!-- name -->` and from `<!-- /name -->` on, marks included.
+
+    Raises:
+        CorrmatError: the file or the marks are missing.
+    """
     if not path.is_file():
         raise CorrmatError(f"no {path} to write into")
     text = path.read_text()
@@ -195,5 +207,4 @@ def replace_between_marks(path: Path, name: str, content: str) -> None:
     if start not in text or end not in text:
         raise CorrmatError(f"{path} has no {start} ... {end} to write into")
     before, rest = text.split(start, 1)
-    after = rest.split(end, 1)[1]
-    replace_text(path, f"{before}{start}\n{content}\n{end}{after}")
+    return before + start, end + rest.split(end, 1)[1]

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import cast
 
+from corrmat.errors import CorrmatError
 from corrmat.reporting.snapshots import PairSnapshot
 
 Metrics = dict[str, float]
@@ -163,8 +164,15 @@ def place_of(scale: str, data: str, identity: str, seed: int) -> Path:
 
 
 def read_record(path: Path) -> Record:
-    """Read a metrics.json."""
-    return Record.from_json(json.loads(path.read_text()))
+    """Read a metrics.json.
+
+    Raises:
+        CorrmatError: it is no record, or cut short.
+    """
+    try:
+        return Record.from_json(json.loads(path.read_text()))
+    except (ValueError, TypeError, AttributeError) as error:
+        raise CorrmatError(f"{path} is no record, or cut short: {error}") from error
 
 
 def read_records(results: Path, scale: str = "*") -> list[Record]:

@@ -1,5 +1,6 @@
 """Lightning callbacks: validation history, atomic checkpoints, and what Ctrl-C does."""
 
+import contextlib
 import io
 import logging
 import math
@@ -221,7 +222,9 @@ class SaveOnInterrupt(Callback):
         if self._stop_now:
             raise KeyboardInterrupt
         self.stop_requested = True
-        log.info("stopping after this step (Ctrl-C again stops at once)")
+        # A signal that comes while a line is printed cannot print another: RuntimeError.
+        with contextlib.suppress(RuntimeError):
+            log.info("stopping after this step (Ctrl-C again stops at once)")
 
     def _restore_handlers(self) -> None:
         for number, handler in self._previous.items():

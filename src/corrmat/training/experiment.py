@@ -108,12 +108,12 @@ def run(
     write_record(results / recipe.place, record, _config(recipe), rows, snapshots)
     for arm in arms:
         runs.mark_recorded(runs_folder / recipe.place / arm.name)
-    loggers.log_record(
-        logger, runs_folder / recipe.place, record, snapshots, results / recipe.place
-    )
     print(terminal_table(record), flush=True)
     log.info(verdicts(record, results))
     log.info(f"pictures and record: {results / recipe.place}/curves.png")
+    loggers.log_record(
+        logger, runs_folder / recipe.place, record, snapshots, results / recipe.place
+    )
     return record
 
 
@@ -199,13 +199,18 @@ def _test(
 def _snapshots(
     module: RegistrationModule, arm: Arm, tests: Tests, recipe: Recipe
 ) -> list[PairSnapshot]:
-    """Take snapshots of the easiest, median and hardest pair of a METHOD_corr."""
+    """Take snapshots of the easiest, median and hardest pair of a METHOD_corr.
+
+    Pairs without a finite prediction are left out: there is nothing to draw.
+    """
     if not isinstance(module, CorrespondenceLoss):
         return []
     module.cpu().eval()
     per_band = len(tests[0]["shape"])
     errors = torch.cat([values["rotation_error_deg"] for values in tests])
-    order = errors.argsort().tolist()
+    order = errors.argsort()[: int(errors.isfinite().sum())].tolist()  # NaN comes last
+    if not order:
+        return []
     snapshots = []
     for rank, position in (("easiest", 0), ("median", len(order) // 2), ("hardest", -1)):
         band, index = divmod(order[position], per_band)

@@ -76,7 +76,8 @@ def _check_optimization(settings: ArmSettings) -> None:
         raise CorrmatError(
             f"--trainer.accumulate_grad_batches {trainer.accumulate_grad_batches} is not positive"
         )
-    for name in ("max_steps", "max_epochs", "limit_train_batches", "limit_test_batches"):
+    limits = "limit_train_batches", "limit_val_batches", "limit_test_batches"
+    for name in ("max_steps", "max_epochs", *limits, "val_check_interval"):
         if getattr(trainer, name) == 0:
             raise CorrmatError(f"--trainer.{name} 0 leaves nothing to do")
     timed = trainer.max_time is not None and trainer.max_epochs is None
