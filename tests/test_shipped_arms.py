@@ -118,3 +118,6 @@ def test_what_cannot_be_exported_or_loaded_is_said(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "huggingface_hub", hub)
     with pytest.raises(CorrmatError, match="hf:somebody/mine cannot be downloaded: no network"):
         corrmat.load_model("hf:somebody/mine")
+    hub.hf_hub_download = lambda *_: (_ for _ in ()).throw(OSError())
+    with pytest.raises(CorrmatError, match="hf:somebody/mine cannot be downloaded: OSError"):
+        corrmat.load_model("hf:somebody/mine")

@@ -195,7 +195,7 @@ def _download(repository: str) -> Path:
     try:
         return Path(hub.hf_hub_download(repository, _MODEL_FILE))
     except Exception as error:  # no network, no such repository, a name that is none
-        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise CorrmatError(f"hf:{repository} cannot be downloaded: {reason}") from error
 
 

@@ -11,19 +11,22 @@ from corrmat.reporting.record import ArmResult, Record, defined
 
 METRIC = "rotation_error_deg_mean"
 COLUMNS = 4
-_SCALE_ORDER = {"laptop": 0, "overnight": 1, "paper": 2}
 
 
 def longest_records(records: Sequence[Record]) -> list[Record]:
-    """Choose one record of each experiment: the longest training, on the embedded shapes first.
+    """Choose one record of each experiment: of most training pairs, on the embedded shapes first.
 
     Records of the smoke scale and of other seeds than 0 are left out.
     """
     best: dict[str, Record] = {}
-    documented = [r for r in records if r.scale in _SCALE_ORDER and r.seed == 0]
-    for record in sorted(documented, key=lambda r: (_SCALE_ORDER[r.scale], r.data == "shapes")):
+    documented = [r for r in records if r.scale != "smoke" and r.seed == 0]
+    for record in sorted(documented, key=lambda r: (_training_pairs(r), r.data == "shapes")):
         best[record.id] = record
     return [best[identity] for identity in sorted(best)]
+
+
+def _training_pairs(record: Record) -> int:
+    return record.arms[record.treatment].pairs_seen
 
 
 def draw_overview(records: Sequence[Record]) -> bytes:
