@@ -127,11 +127,10 @@ def test_a_curve_with_errors_that_are_no_numbers_or_without_a_point():
     assert claims.sooner(evidence(drawn(6.0), drawn(0.3))) is None
 
 
-def test_the_verdicts_are_counted(monkeypatch):
+def test_the_verdicts_are_counted():
     claim = claims.Claim("", "", "", "", "confirmed")
     other = dataclasses.replace(claim, verdict="not shown")
-    monkeypatch.setattr(claims, "claims_of", lambda *_: [claim, other, claim])
-    assert claims.count_verdicts([], None) == (
+    assert claims.count_verdicts([claim, other, claim]) == (
         "2 confirmed, 0 confirmed in direction, 1 not shown, 0 contradicted"
     )
 

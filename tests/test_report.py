@@ -155,10 +155,15 @@ def test_what_the_paper_misprinted_is_marked():
     ]
 
 
+@pytest.fixture(scope="module")
+def committed():
+    return documents.Results(ROOT / "results")
+
+
 @pytest.mark.parametrize(
     ("page", "name", "content"), documents.TABLES, ids=lambda value: str(value)
 )
-def test_the_documents_say_what_the_records_say(page, name, content):
+def test_the_documents_say_what_the_records_say(page, name, content, committed):
     """Fails when a record is committed and `make docs` was not run.
 
     A record made anew in a working copy differs at least in its minutes: not a mistake.
@@ -171,9 +176,8 @@ def test_the_documents_say_what_the_records_say(page, name, content):
         pytest.skip("results/ is not as committed")
     text = (ROOT / page).read_text()
     shown = re.search(f"<!-- {name} -->\n(.*)\n<!-- /{name} -->", text, re.DOTALL)
-    records = documents.documented_records(ROOT / "results")
-    assert records
-    assert shown[1] == content(records, ROOT / "results")
+    assert committed.records
+    assert shown[1] == content(committed)
 
 
 def test_every_place_that_the_map_of_the_paper_names_is_there():
@@ -197,8 +201,10 @@ def test_every_place_that_the_map_of_the_paper_names_is_there():
     assert named > 25
 
 
-def test_the_overview_has_a_panel_for_the_longest_training_of_each_experiment(monkeypatch):
-    records = documents.documented_records(ROOT / "results")
+def test_the_overview_has_a_panel_for_the_longest_training_of_each_experiment(
+    monkeypatch, committed
+):
+    records = committed.records
     chosen = overview.longest_records(records)
     assert [record.id for record in chosen] == sorted({record.id for record in records})
     longest = {record.id: record.scale for record in chosen}

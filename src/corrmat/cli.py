@@ -197,8 +197,8 @@ def _compare(options: Namespace) -> int:
 def _register(options: Namespace) -> int:
     """Register one file, or several, onto another."""
     several = len(options.source) > 1
-    files = [options.json, options.html, options.gif, *([] if several else [options.output])]
-    for path in [path for path in files if path is not None]:
+    files = [options.json, options.html, options.gif, None if several else options.output]
+    for path in filter(None, files):
         if path.is_dir():
             raise CorrmatError(f"{path} is a folder, not a file to write")
         if not path.parent.is_dir():
@@ -254,15 +254,16 @@ def _register_several(options: Namespace) -> int:
     """Register several files onto one."""
     if options.html or options.gif:
         raise CorrmatError("--html and --gif show two scans; --output moves several, to look at")
-    if options.output is not None and not options.output.is_dir():
-        raise CorrmatError(
-            f"{options.output}: with several scans, --output is a folder that exists"
-        )
     names = [path.with_suffix(".ply").name for path in options.source]
-    if options.output is not None and len(set(names)) < len(names):
-        raise CorrmatError(f"two scans would both be written to {options.output}: rename one")
-    for name in names if options.output is not None else []:
-        _keep_scans(options, options.output / name)
+    if options.output is not None:
+        if not options.output.is_dir():
+            raise CorrmatError(
+                f"{options.output}: with several scans, --output is a folder that exists"
+            )
+        if len(set(names)) < len(names):
+            raise CorrmatError(f"two scans would both be written to {options.output}: rename one")
+        for name in names:
+            _keep_scans(options, options.output / name)
     from corrmat.data.scans import read_scan, write_ply
     from corrmat.files import replace_text
 

@@ -161,14 +161,7 @@ class Cloud:
         size = min(FULL_POINTS, len(rank))
         few = np.argpartition(rank, size)[:size] if len(rank) > size else np.arange(size)
         rows = few[np.argsort(rank[few])]
-        with np.errstate(over="ignore"):
-            offset = values[rows, :3] - np.median(values[rows, :3], axis=0)
-            distance = np.linalg.norm(offset, axis=1)
-        typical = np.median(distance)
-        if not np.isfinite(typical):
-            raise CorrmatError(f"{name}: coordinates are too large to compute distances")
-        if typical > 0:
-            rows = rows[distance <= FAR * typical]
+        rows = rows[_is_near(values[rows, :3], name)]
         checked = cls(rows, values[rows])
         length, breadth, _ = np.linalg.svd(checked.centred, compute_uv=False)[:3]
         noise = 1e-12 * np.abs(checked.values[:, :3]).max() * np.sqrt(len(rows))
@@ -191,6 +184,21 @@ class Cloud:
         points = self.points(scale, count)
         given = self.values[:count, 3:]
         return np.hstack([points, given if given.shape[1] else estimate_normals(points)])
+
+
+def _is_near(points: np.ndarray, name: str) -> np.ndarray:
+    """Tell which points (N, 3) are no stray ones: (N,) bool.
+
+    Raises:
+        CorrmatError: coordinates are too large to be squared.
+    """
+    with np.errstate(over="ignore"):
+        distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    typical = np.median(distance)
+    if not np.isfinite(typical):
+        raise CorrmatError(f"{name}: coordinates are too large to compute distances")
+    # Where most points are equal there is no measure; that is refused elsewhere.
+    return distance <= FAR * typical if typical else np.ones(len(points), bool)
 
 
 def _hash(values: np.ndarray, seed: int) -> np.ndarray:

@@ -361,9 +361,9 @@ def _judge(record: Record, results: Path) -> list[Claim]:
     return [claim for claim in claims if claim is not None]
 
 
-def count_verdicts(records: Sequence[Record], results: Path) -> str:
-    """Say how many of the ledger's verdicts are of each kind."""
-    counts = Counter(claim.verdict for claim in claims_of(records, results))
+def count_verdicts(claims: Sequence[Claim]) -> str:
+    """Say how many verdicts of the ledger are of each kind."""
+    counts = Counter(claim.verdict for claim in claims)
     return ", ".join(f"{counts[verdict]} {verdict}" for verdict in get_args(Verdict))
 
 
@@ -377,14 +377,11 @@ def verdicts(record: Record, results: Path) -> str:
     return "\n".join(f"{claim.verdict}: {claim.words}\n    {claim.ours}" for claim in claims)
 
 
-def markdown_claims(records: Sequence[Record], results: Path) -> str:
+def markdown_claims(claims: Sequence[Claim]) -> str:
     """Build the ledger as a Markdown table."""
     heads = ["claim", "paper", "ours", "record", "verdict"]
     lines = [markdown_row(heads), "|" + "---|" * len(heads)]
-    lines += [
-        markdown_row([c.words, c.paper, c.ours, c.where, f"**{c.verdict}**"])
-        for c in claims_of(records, results)
-    ]
+    lines += [markdown_row([c.words, c.paper, c.ours, c.where, f"**{c.verdict}**"]) for c in claims]
     return "\n".join(lines)
 
 

@@ -16,6 +16,7 @@ from corrmat.weights import shipped_calibration, verdict
 
 OURS = "corrmat"
 _PROTOCOLS = ("real", "views", "clean", "rooms")  # in the order of the tables
+_KINDS = {"single objects": ("shapes", "modelnet40"), "rooms": ("procedural",)}  # data sets of each
 _BINS = 10  # of the expected calibration error
 
 
@@ -77,28 +78,28 @@ def confidence_table(results: Path) -> str:
     objects and of rooms.
     """
     heads = ["data", "confidence", "pairs", "promised", "aligned"]
-    lines = [markdown_row(heads), "|---|---|---|---|---|"]
-    everything = []
-    for data in ("shapes", "modelnet40", "procedural"):
-        records = [r["models"][OURS] for r in _read_comparisons(results) if r["data"] == data]
-        if not records:
-            continue
-        promised = np.concatenate([_confidence(row) for row in records])
-        aligned = np.concatenate([_aligned(row) for row in records])
-        everything.append((data, promised, aligned))
-        for low, high in itertools.pairwise((0, 0.25, 0.5, 0.75, 1.01)):
-            inside = (low <= promised) & (promised < high)
-            if inside.any():
-                means = [f"{values[inside].mean():.0%}" for values in (promised, aligned)]
-                span = f"{low:.0%} to {min(high, 1):.0%}"
-                lines.append(markdown_row([data, span, str(inside.sum()), *means]))
-    for rooms, what in ((False, "single objects"), (True, "rooms")):
-        chosen = [row[1:] for row in everything if (row[0] == "procedural") == rooms]
-        if not chosen:
-            continue
-        promised, aligned = map(np.concatenate, zip(*chosen, strict=True))
-        lines += ["", f"{len(promised)} pairs of {what}: {_reliability(promised, aligned)}."]
-    return "\n".join(lines)
+    lines, summaries = [markdown_row(heads), "|---|---|---|---|---|"], []
+    comparisons = _read_comparisons(results)
+    for what, data_sets in _KINDS.items():
+        both = []
+        for data in data_sets:
+            rows = [r["models"][OURS] for r in comparisons if r["data"] == data]
+            if not rows:
+                continue
+            promised = np.concatenate([_confidence(row) for row in rows])
+            aligned = np.concatenate([_aligned(row) for row in rows])
+            both.append((promised, aligned))
+            for low, high in itertools.pairwise((0, 0.25, 0.5, 0.75, 1.01)):
+                inside = (low <= promised) & (promised < high)
+                if inside.any():
+                    means = [f"{values[inside].mean():.0%}" for values in (promised, aligned)]
+                    span = f"{low:.0%} to {min(high, 1):.0%}"
+                    lines.append(markdown_row([data, span, str(inside.sum()), *means]))
+        if both:
+            promised, aligned = map(np.concatenate, zip(*both, strict=True))
+            said = _reliability(promised, aligned)
+            summaries += ["", f"{len(promised)} pairs of {what}: {said}."]
+    return "\n".join(lines + summaries)
 
 
 def _reliability(promised: np.ndarray, aligned: np.ndarray) -> str:
@@ -179,7 +180,7 @@ def draw_training(results: Path) -> None:
     recall.set(title="within 5 degrees, validation, %", xlabel="pairs seen", xscale="log")
     recall.set_xticks([*(run["pairs"] for run in runs), 2 * runs[-1]["pairs"]])
     recall.xaxis.set_minor_locator(NullLocator())
-    recall.legend(loc="center left")
+    figure.legend(*recall.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     for axes in (loss, recall):
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.grid(alpha=0.3)

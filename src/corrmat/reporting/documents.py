@@ -1,5 +1,6 @@
 """Rewrites the tables of README.md and docs/, and redraws their pictures, from results/."""
 
+import functools
 import json
 from collections import defaultdict
 from collections.abc import Callable
@@ -7,7 +8,14 @@ from pathlib import Path
 
 from corrmat.errors import CorrmatError
 from corrmat.files import replace_bytes, replace_text
-from corrmat.reporting.claims import count_verdicts, headline, markdown_claims, read_evidence
+from corrmat.reporting.claims import (
+    Claim,
+    claims_of,
+    count_verdicts,
+    headline,
+    markdown_claims,
+    read_evidence,
+)
 from corrmat.reporting.comparisons import (
     comparison_summary,
     comparison_table,
@@ -25,12 +33,28 @@ from corrmat.reporting.writer import draw_record
 HEADLINES = ("1.2", "1.3", "2.1", "2.2", "3.2", "outliers")  # experiments of README's table
 
 
-def claims_table(results: Path) -> str:
-    """Build the ledger of claims from the records of every scale but smoke."""
-    return markdown_claims(read_records(results), results)
+class Results:
+    """A folder of records; what several tables need of it is read and judged once.
+
+    Args:
+        folder: results/.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    @functools.cached_property
+    def records(self) -> list[Record]:
+        """The records of README.md and docs/reproduction.md: every scale but smoke, seed 0."""
+        return [r for r in read_records(self.folder) if r.scale != "smoke" and r.seed == 0]
+
+    @functools.cached_property
+    def claims(self) -> list[Claim]:
+        """The ledger, judged by the records of every scale but smoke and of every seed."""
+        return claims_of(read_records(self.folder), self.folder)
 
 
-def headline_table(results: Path) -> str:
+def headline_table(results: Results) -> str:
     """Build README's table: six experiments, each by the longest training that is recorded.
 
     Below it stands how many verdicts of the whole ledger are of each kind.
@@ -46,10 +70,10 @@ def headline_table(results: Path) -> str:
         "verdict",
     ]
     lines = [markdown_row(heads), "|" + "---|" * len(heads)]
-    for record in longest_records(documented_records(results)):
+    for record in longest_records(results.records):
         if record.id in HEADLINES:
-            lines.append(markdown_row(headline(read_evidence(record, results))))
-    counted = count_verdicts(read_records(results), results)
+            lines.append(markdown_row(headline(read_evidence(record, results.folder))))
+    counted = count_verdicts(results.claims)
     return "\n".join([*lines, "", f"All verdicts of the [ledger](docs/claims.md): {counted}."])
 
 
@@ -133,33 +157,28 @@ def _bench_row(row: dict[str, float | str]) -> str:
     return markdown_row([what, time, str(row.get("peak_mb", "")), share, ", ".join(ratios)])
 
 
-# document, mark in it, content from the records and the folder results/
-TABLES: tuple[tuple[str, str, Callable[[list[Record], Path], str]], ...] = (
-    ("README.md", "headline", lambda _, results: headline_table(results)),
-    ("README.md", "register", lambda _, results: comparison_summary(results)),
-    ("docs/reproduction.md", "results", lambda records, _: markdown_summary(records)),
-    ("docs/reproduction.md", "rates", lambda _, results: rates_table(results)),
-    ("docs/reproduction.md", "seeds", lambda _, results: seeds_table(results)),
-    ("docs/reproduction.md", "tables", lambda records, _: markdown_tables(records)),
-    ("docs/claims.md", "claims", lambda _, results: claims_table(results)),
-    ("docs/register.md", "comparison", lambda _, results: comparison_table(results)),
-    ("docs/register.md", "networks", lambda _, results: networks_table(results)),
-    ("docs/register.md", "doubling", lambda _, results: doubling_summary(results)),
-    ("docs/register.md", "confidence", lambda _, results: confidence_table(results)),
-    ("docs/speed.md", "bench", lambda _, results: bench_table(results)),
+# document, mark in it, and its content
+TABLES: tuple[tuple[str, str, Callable[[Results], str]], ...] = (
+    ("README.md", "headline", headline_table),
+    ("README.md", "register", lambda results: comparison_summary(results.folder)),
+    ("docs/reproduction.md", "results", lambda results: markdown_summary(results.records)),
+    ("docs/reproduction.md", "rates", lambda results: rates_table(results.folder)),
+    ("docs/reproduction.md", "seeds", lambda results: seeds_table(results.folder)),
+    ("docs/reproduction.md", "tables", lambda results: markdown_tables(results.records)),
+    ("docs/claims.md", "claims", lambda results: markdown_claims(results.claims)),
+    ("docs/register.md", "comparison", lambda results: comparison_table(results.folder)),
+    ("docs/register.md", "networks", lambda results: networks_table(results.folder)),
+    ("docs/register.md", "doubling", lambda results: doubling_summary(results.folder)),
+    ("docs/register.md", "confidence", lambda results: confidence_table(results.folder)),
+    ("docs/speed.md", "bench", lambda results: bench_table(results.folder)),
 )
 
 
-def documented_records(results: Path) -> list[Record]:
-    """Read the records of README.md and docs/reproduction.md: every scale but smoke, seed 0."""
-    return [r for r in read_records(results) if r.scale != "smoke" and r.seed == 0]
-
-
-def rewrite_documents(results: Path, root: Path) -> int:
+def rewrite_documents(folder: Path, root: Path) -> int:
     """Rewrite every table of the documents and redraw the records' pictures.
 
     Args:
-        results: folder of records.
+        folder: of records.
         root: folder of README.md and docs/.
 
     Returns:
@@ -170,18 +189,18 @@ def rewrite_documents(results: Path, root: Path) -> int:
     """
     for page, mark, _ in TABLES:
         _split_at_marks(root / page, mark)
-    records = documented_records(results)
-    for record in records:
-        draw_record(results / record.place)
-    draw_training(results)
-    matrices = draw_matrices(results)
+    results = Results(folder)
+    for record in results.records:
+        draw_record(folder / record.place)
+    draw_training(folder)
+    matrices = draw_matrices(folder)
     if matrices is not None:
         replace_bytes(root / "docs" / "matrices.png", matrices)
-    overview = draw_overview(longest_records(records))
+    overview = draw_overview(longest_records(results.records))
     replace_bytes(root / "docs" / "overview.png", overview)
     for page, mark, content in TABLES:
-        replace_between_marks(root / page, mark, content(records, results))
-    return len(records)
+        replace_between_marks(root / page, mark, content(results))
+    return len(results.records)
 
 
 def replace_between_marks(path: Path, name: str, content: str) -> None:

@@ -98,7 +98,7 @@ def _wandb_mode() -> str:
 def _start_run(folder: Path, job: str, group: str, config: Mapping[str, object]) -> "Run":
     """Start a wandb run that writes below a folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name in ("WANDB_DATA_DIR", "WANDB_CACHE_DIR", "WANDB_CONFIG_DIR"):  # not in a user's home
+    for name in ("WANDB_DATA_DIR", "WANDB_CACHE_DIR"):  # not in a home that may be read-only
         os.environ.setdefault(name, str(folder.absolute() / "wandb"))
     import wandb  # starts slowly, and not everybody wants it
 
