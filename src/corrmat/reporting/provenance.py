@@ -124,6 +124,7 @@ def _path(module: str, package: Path) -> Path | None:
     return path if path.is_file() else None
 
 
+@functools.cache  # records share most of their code and commits
 def _meaning(name: str, text: str, scale: str) -> object:
     """Parse a recipe, as far as it decides how arms train at a scale, or a module.
 
