@@ -6,6 +6,7 @@ import shutil
 import subprocess
 
 import pytest
+from conftest import ROOT
 from test_report import RECORD
 
 from corrmat.cli import main
@@ -74,6 +75,10 @@ def test_every_section_is_there_and_nothing_is_fetched(results):
     assert {f"smoke-shapes-1.1-{rank}" for rank in ("easiest", "median", "hardest")} < drawn
 
 
+def test_the_page_of_the_committed_records_is_below_8_megabytes():
+    assert len(build_page(ROOT / "results")) < 8e6
+
+
 def test_every_number_names_the_file_and_the_command_it_comes_from(results):
     html = build_page(results)
     titles = re.findall(r'title="([^"]+)"', html[: html.index("<script>")])
@@ -100,6 +105,16 @@ def test_the_slider_of_a_view_shows_one_stage_at_a_time(results):
     assert [step["label"] for step in steps] == ["before", "iteration 1"]
     for step in steps:
         assert sum(step["args"][0]["visible"]) == 5
+    iterated = plots.snapshot_plot(
+        PairSnapshot.from_json(snapshot | {"steps": snapshot["steps"] * 3})
+    )
+    for step in iterated["layout"]["sliders"][0]["steps"]:
+        shown = [
+            t["name"]
+            for t, v in zip(iterated["data"], step["args"][0]["visible"], strict=True)
+            if v
+        ]
+        assert sorted(shown) == sorted(trace["name"] for trace in actual["data"][5:])
     names = [trace["name"] for trace in actual["data"][5:]]
     assert names == ["target", "source", "right matches", "wrong matches", "called outlier"]
     assert actual["data"][8]["x"] == [1.0, 0.0, None]  # the one wrong match: 1 -> 2

@@ -13,7 +13,6 @@ from corrmat.reporting.snapshots import PairSnapshot, Stage, stages, thin
 Plot = dict[str, object]
 """A plotly figure: `data` and `layout`."""
 QUANTILES = np.linspace(0, 1, 51)
-_TRACES = 5  # of a stage
 _MAX_POINTS, _MAX_LINES = 70, 36  # drawn of a cloud, of the matches: the page stays small
 
 
@@ -76,15 +75,19 @@ def errors_plot(per_pair: Path, record: Record) -> Plot:
 def snapshot_plot(snapshot: PairSnapshot) -> Plot:
     """Plot a pair in 3-D, with a slider over the network's iterations."""
     scenes = stages(snapshot)
-    data = []
+    last = len(scenes) - 1
+    traces: list[tuple[Plot, range]] = []  # each with the stages that show it
     for index, stage in enumerate(scenes):
-        visible = {"visible": index == len(scenes) - 1}
-        data += [trace | visible for trace in _stage_traces(stage)]
+        target, *others = _stage_traces(stage)
+        if index < 2:  # it is set aside before, and then stays where it is
+            traces.append((target, range(1, last + 1) if index else range(1)))
+        traces += [(trace, range(index, index + 1)) for trace in others]
+    data = [trace | {"visible": last in shown} for trace, shown in traces]
     steps = [
         {
             "label": stage.label,
             "method": "restyle",
-            "args": [{"visible": [i // _TRACES == index for i in range(len(data))]}],
+            "args": [{"visible": [index in shown for _, shown in traces]}],
         }
         for index, stage in enumerate(scenes)
     ]
