@@ -57,7 +57,9 @@ def run(pairs: PairBatch, name: str, voxel: float) -> benchmark.ModelResult:
         transform = scorer.refine(PIPELINES[name](source, target, voxel))
         ms = 1e3 * (time.perf_counter() - start)
         angle, adds = benchmark.errors(pairs, index, transform)
-        outcomes.append(benchmark.Outcome(angle, adds, ms, scorer.agreement(transform), 1.0))
+        outcomes.append(
+            benchmark.Outcome(angle, adds, ms, scorer.alignment(transform).agreement, 1.0)
+        )
     return benchmark.summarise(pairs, outcomes)
 
 

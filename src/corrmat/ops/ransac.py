@@ -25,11 +25,9 @@ def ransac(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Find the rigid transforms that most of the matches agree on.
 
-    All hypotheses are evaluated at once, as a batch. Three matches make a hypothesis. Triples
-    whose triangles differ in a side by more than the threshold cannot be rigid and are dropped
-    before anything is fitted. A transform scores the weight of the matches that it explains, each
-    less the larger its residual (MSAC, Torr & Zisserman 2000). The best distinct transforms are
-    refitted to the matches that they explain.
+    All hypotheses are evaluated at once, as a batch. A transform scores the weight of the matches
+    that it explains, each less the larger its residual (MSAC, Torr & Zisserman 2000). The best
+    distinct transforms are refitted to the matches that they explain.
 
     Args:
         x: (K, 3) source points of K matches, at least three.
@@ -45,26 +43,72 @@ def ransac(
         Rotations (T, 3, 3), translations (T, 3) and scores (T,), best first; T = 0 if no triple
         of matches is rigid, or no match has a weight.
     """
+    rotation, translation = fit_triples(
+        x, y, weight, inlier_threshold, generator=generator, draws=draws, fits=fits
+    )
+    return best_by_matches(rotation, translation, x, y, weight, inlier_threshold, count)
+
+
+@torch.no_grad()
+def fit_triples(
+    x: Tensor,
+    y: Tensor,
+    weight: Tensor,
+    inlier_threshold: float,
+    *,
+    generator: torch.Generator,
+    draws: int = 20000,
+    fits: int = 1000,
+) -> tuple[Tensor, Tensor]:
+    """Fit rigid transforms to random triples of matches; see `ransac`.
+
+    Triples whose triangles differ in a side by more than the threshold cannot be rigid, and
+    triangles with a side below twice the threshold fix no rotation: both are dropped before
+    anything is fitted.
+
+    Returns:
+        Rotations (F, 3, 3) and translations (F, 3), in the order of the draws.
+    """
     x, y, weight = x.double(), y.double(), weight.double()
     if not (weight > 0).any():
-        return x.new_empty(0, 3, 3), x.new_empty(0, 3), x.new_empty(0)
+        return x.new_empty(0, 3, 3), x.new_empty(0, 3)
     triple = torch.multinomial(weight, 3 * draws, replacement=True, generator=generator).view(-1, 3)
     sides_x, sides_y = _side_lengths(x[triple]), _side_lengths(y[triple])
     rigid_enough = (sides_x - sides_y).abs().amax(1) < inlier_threshold
     wide_enough = sides_x.amin(1) > 2 * inlier_threshold
     triple = triple[rigid_enough & wide_enough][:fits]
     if not len(triple):
-        return x.new_empty(0, 3, 3), x.new_empty(0, 3), x.new_empty(0)
-    rotation, translation = rigid.procrustes(x[triple], y[triple])
+        return x.new_empty(0, 3, 3), x.new_empty(0, 3)
+    return rigid.procrustes(x[triple], y[triple])
+
+
+@torch.no_grad()
+def best_by_matches(
+    rotation: Tensor,
+    translation: Tensor,
+    x: Tensor,
+    y: Tensor,
+    weight: Tensor,
+    inlier_threshold: float,
+    count: int,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Select the transforms (F, 3, 3), (F, 3) that explain most matches, and refit them to those.
+
+    Returns:
+        As `ransac`.
+    """
+    if not len(rotation):
+        return rotation, translation, translation.new_empty(0)
+    x, y, weight = x.double(), y.double(), weight.double()
     score, _ = _score(rotation, translation, x, y, weight, inlier_threshold)
-    best = _best_distinct(rotation, score, count)
+    best = best_distinct(rotation, score, count)
     rotation, translation = rotation[best], translation[best]
     for _ in range(_REFITS):
         _, explained = _score(rotation, translation, x, y, weight, inlier_threshold)
         matches = x.expand(len(rotation), -1, -1), y.expand(len(rotation), -1, -1)
         rotation, translation = rigid.procrustes(*matches, explained)
     score, _ = _score(rotation, translation, x, y, weight, inlier_threshold)
-    best = _best_distinct(rotation, score, count)
+    best = best_distinct(rotation, score, count)
     return rotation[best], translation[best], score[best]
 
 
@@ -88,7 +132,7 @@ def _score(
     return explained.sum(1), explained
 
 
-def _best_distinct(rotation: Tensor, score: Tensor, count: int) -> Tensor:
+def best_distinct(rotation: Tensor, score: Tensor, count: int) -> Tensor:
     """Select up to `count` indices by falling score, skipping rotations near a better one."""
     candidates, selected = score.argsort(descending=True), []
     while len(candidates) and len(selected) < count:
@@ -97,4 +141,4 @@ def _best_distinct(rotation: Tensor, score: Tensor, count: int) -> Tensor:
         cosine = ((rotation[candidates] * rotation[best]).sum((1, 2)) - 1) / 2
         candidates = candidates[cosine < _SAME_ROTATION]
         candidates = candidates[candidates != best]
-    return torch.stack(selected)
+    return torch.stack(selected) if selected else score.new_empty(0, dtype=torch.int64)

@@ -22,8 +22,11 @@ from corrmat.baselines import (
     kiss_matcher,
 )
 from corrmat.errors import CorrmatError
-from corrmat.ops.ransac import ransac as ransac_on_matches
+from corrmat.ops.ransac import best_by_matches, best_distinct, fit_triples
 
+_RANKED = 500  # fits that are ranked by agreement
+_ROUGH_POINTS = 64, 256  # of source and target, to rank them by
+_ROUGH_DISTANCE = 0.3  # beyond which two points do not agree
 _SUPPORT_DISTANCE = 0.2  # residual beyond which a match does not support a transform
 _NO_MATCHES = np.empty((0, 2), np.int64), np.empty(0)
 
@@ -64,11 +67,16 @@ HypothesisGenerator = Callable[[np.ndarray, np.ndarray, int], Hypotheses]
 class NetworkHypotheses:
     """Hypotheses from a network's correspondence matrix: RANSAC on its strongest matches.
 
+    The transforms that RANSAC fits to triples of matches are ranked twice: by the matches that they
+    explain, and by how well they put the clouds on each other, which right transforms do even
+    where most matches are wrong.
+
     Args:
         network: (source, target) -> Prediction with a correspondence.
         inlier_threshold: largest residual of a match.
         num_matches: strongest matches used.
-        count: hypotheses of RANSAC at most; the network's own transform comes on top.
+        count: hypotheses by matches at most; the network's own transform comes on top.
+        count_by_agreement: hypotheses by agreement of the clouds at most.
     """
 
     def __init__(
@@ -77,10 +85,11 @@ class NetworkHypotheses:
         inlier_threshold: float = 0.15,
         num_matches: int = 256,
         count: int = 16,
+        count_by_agreement: int = 8,
     ) -> None:
         self.network = network.eval()
         self.inlier_threshold, self.num_matches = inlier_threshold, num_matches
-        self.count = count
+        self.count, self.count_by_agreement = count, count_by_agreement
 
     @torch.no_grad()
     def __call__(self, source: np.ndarray, target: np.ndarray, seed: int) -> Hypotheses:
@@ -99,17 +108,40 @@ class NetworkHypotheses:
         weight, place = (prob * is_max).flatten().topk(min(self.num_matches, prob.numel()))
         weight, place = weight[weight > 0], place[weight > 0]
         i, j = place // prob.shape[1], place % prob.shape[1]
-        rotation, translation, _ = ransac_on_matches(
-            x[0, i, :3],
-            y[0, j, :3],
-            weight.sqrt(),
-            self.inlier_threshold,
-            generator=torch.Generator().manual_seed(seed),
-            count=self.count,
-        )
+        weighted = x[0, i, :3], y[0, j, :3], weight.sqrt(), self.inlier_threshold
+        fits = fit_triples(*weighted, generator=torch.Generator().manual_seed(seed))
+        rotation, translation, _ = best_by_matches(*fits, *weighted, self.count)
         transforms = [_matrix(r, t) for r, t in zip(rotation, translation, strict=True)]
+        rotation, translation = (t[:_RANKED] for t in fits)
+        score = rough_agreement(rotation, translation, x[0], y[0])
+        best = best_distinct(rotation, score, self.count_by_agreement)
+        transforms += [_matrix(rotation[k], translation[k]) for k in best]
         matches = torch.stack([i, j], 1).numpy()
         return Hypotheses(np.stack([*transforms, *own_transform]), matches, weight.double().numpy())
+
+
+def rough_agreement(
+    rotation: torch.Tensor, translation: torch.Tensor, source: torch.Tensor, target: torch.Tensor
+) -> torch.Tensor:
+    """Score how well many transforms put a few source points on the target.
+
+    Args:
+        rotation: (F, 3, 3).
+        translation: (F, 3).
+        source: (N, 6) xyz and unit normals of any sign, in random order.
+        target: (M, 6), the same.
+
+    Returns:
+        (F,) in [0, 1]; see `scoring.Alignment`.
+    """
+    source, target = source[: _ROUGH_POINTS[0]], target[: _ROUGH_POINTS[1]]
+    rotation, translation = rotation.to(source), translation.to(source)
+    moved = source[:, :3] @ rotation.mT + translation.unsqueeze(1)
+    normals = source[:, 3:6] @ rotation.mT
+    distance, nearest = torch.cdist(moved.flatten(0, 1), target[:, :3]).min(1)
+    parallel = (normals.flatten(0, 1) * target[nearest, 3:6]).sum(1).abs()
+    closeness = 1 - (distance / _ROUGH_DISTANCE).square()
+    return (parallel * closeness.clamp_min(0)).view(moved.shape[:2]).mean(1)
 
 
 def _matrix(rotation: torch.Tensor, translation: torch.Tensor) -> np.ndarray:

@@ -9,13 +9,16 @@ from pathlib import Path
 import numpy as np
 from rich.progress import track
 from scipy.spatial.transform import Rotation
+from torch import nn
 
 from corrmat.errors import CorrmatError
-from corrmat.registration.register import Refine, matrix_lines, register
+from corrmat.registration.register import Cloud, Refine, matrix_lines, register
 from corrmat.weights import verdict
 
 _SWEEPS = 50  # of averaging; poses settle within ten
-_ANGLE_DEG, _SHARE = 10.0, 0.1  # how far a registration may be off the poses to agree with them
+# How far a registration may be off the poses to agree with them: in degrees, and as a share of the
+# median distance of a scan's points from their middle.
+_ANGLE_DEG, _SHARE = 10.0, 0.2
 
 
 @dataclass(frozen=True)
@@ -31,7 +34,7 @@ class ScanPose:
 def register_scans(
     scans: Sequence[np.ndarray],
     *,
-    model: str | Path = "corrmat",
+    model: str | Path | nn.Module = "corrmat",
     refine: Refine = "icp",
     seed: int = 0,
 ) -> list[ScanPose]:
@@ -55,12 +58,14 @@ def register_scans(
     """
     if len(scans) < 2:
         raise CorrmatError(f"{len(scans)} scan: two or more are needed")
-    clouds = [np.asarray(scan, np.float64)[:, :3] for scan in scans]
+    for number, scan in enumerate(scans, 1):  # so that errors name the right one
+        Cloud.of(scan, f"scan {number} of {len(scans)}", seed)
     edges = []
     pairs = list(itertools.combinations(range(len(scans)), 2))
     for i, j in track(pairs, "registering pairs", transient=True, disable=len(pairs) == 1):
-        found = register(scans[i], scans[j], model=model, refine=refine, seed=seed)
-        edges.append(_Edge(i, j, found.transform, found.confidence))
+        registration = register(scans[i], scans[j], model=model, refine=refine, seed=seed)
+        edges.append(_Edge(i, j, registration.transform, registration.confidence))
+    clouds = [np.asarray(scan, np.float64)[:, :3] for scan in scans]  # register has checked them
     graph = _PoseGraph(clouds, edges)
     return [graph.pose(index) for index in range(len(scans) - 1)]
 
@@ -110,7 +115,7 @@ class _PoseGraph:
     def __init__(self, clouds: Sequence[np.ndarray], edges: Sequence[_Edge]) -> None:
         self.edges, self.last = edges, len(clouds) - 1
         self.centres = np.stack([cloud.mean(0) for cloud in clouds])
-        sizes = [np.linalg.norm(c - c.mean(0), axis=1).max() for c in clouds]
+        sizes = [np.median(np.linalg.norm(c - np.median(c, axis=0), axis=1)) for c in clouds]
         self.tolerance = _SHARE * float(np.mean(sizes))
         self.rotations = np.stack([np.eye(3)] * len(clouds))
         self.images = self.centres.copy()  # of the centroids, in the last scan's frame

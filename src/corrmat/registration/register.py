@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from torch import nn
 
 from corrmat.data.normals import estimate_normals
 from corrmat.errors import CorrmatError
@@ -19,6 +20,8 @@ Refine = Literal["icp", "none"]
 MODEL_POINTS = 1024  # points of either cloud for the model
 SELECTION_POINTS = 2048  # to select among its hypotheses
 FULL_POINTS = 20_000  # to refine the selected one
+# A candidate scores agreement + these times coherence and support; see benchmarks/choice.py.
+COHERENCE_WEIGHT, SUPPORT_WEIGHT = 1.5, 0.2
 MEDIAN = 0.6  # median distance from the centroid after scaling: a radius of about one
 MAX_NORMAL = 1.01  # longest given normal
 FAR = 30.0  # median distances from the middle: a point beyond is a stray one and left out
@@ -35,9 +38,9 @@ class Registration:
     match_agrees: np.ndarray  # (K,) bool: whether the transform takes one end near the other
     agreement: float  # in [0, 1]: how much of either cloud lies on the other
     support: float  # in [0, 1]: share of the matches that the transform explains; 1 without any
-    confidence: float  # in [0, 1]: calibrated chance that the clouds are aligned
+    confidence: float  # in [0, 1]: chance that the clouds are aligned, calibrated for "corrmat"
     rmse: float  # of aligned source points near a target point, in the clouds' units
-    overlap: float  # share of source points near a target point
+    overlap: float  # share of source points near a target point: twice the spacing of points
     verdict: str  # "aligned", or "probably aligned: " or "doubtful: " and why
     model: str
     seed: int
@@ -54,7 +57,7 @@ def register(
     source: np.ndarray,
     target: np.ndarray,
     *,
-    model: str | Path = "corrmat",
+    model: str | Path | nn.Module = "corrmat",
     refine: Refine = "icp",
     seed: int = 0,
 ) -> Registration:
@@ -67,8 +70,9 @@ def register(
     Args:
         source: (N, 3), or (N, 6) with unit normals.
         target: (M, 3), or (M, 6).
-        model: "corrmat" for the shipped weights; "icp", "ransac" or "fgr" for the classical
-            pipelines; or a checkpoint file.
+        model: "corrmat" for the shipped weights; "icp", or where they are installed "ransac",
+            "ransac17", "fgr" or "kiss", for the classical pipelines; whatever else `load_model`
+            takes; or a network, or a method, of your own.
         refine: "icp" on up to 20,000 points of each cloud after the model, or "none".
         seed: of subsampling and of the model's random draws.
 
@@ -83,7 +87,11 @@ def register(
         raise CorrmatError(f"refine = {refine!r}; choices: icp, none")
     if not 0 <= seed < 2**63:
         raise CorrmatError(f"seed = {seed} is not between 0 and 2^63")
-    generate: HypothesisGenerator = CLASSICAL.get(str(model)) or _load_network(str(model))
+    if isinstance(model, nn.Module):
+        generate: HypothesisGenerator = NetworkHypotheses(getattr(model, "network", model))
+        model = type(model).__name__
+    else:
+        generate = CLASSICAL.get(str(model)) or _load_network(str(model))
     start = time.perf_counter()
     x, y = Cloud.of(source, "source", seed), Cloud.of(target, "target", seed)
     scale = 2 * MEDIAN / (x.median + y.median)
@@ -93,10 +101,14 @@ def register(
     transforms = hypotheses.transforms
     if refine == "icp":
         transforms = np.stack([scorer.refine(transform) for transform in transforms])
-    agreements = [scorer.agreement(transform) for transform in transforms]
+    alignments = [scorer.alignment(transform) for transform in transforms]
     supports = [hypotheses.support(transform, *subsamples) for transform in transforms]
-    best = int(np.argmax(agreements))
-    transform, agreement, support = transforms[best], agreements[best], supports[best]
+    scores = [
+        alignment.agreement + COHERENCE_WEIGHT * alignment.coherence + SUPPORT_WEIGHT * support
+        for alignment, support in zip(alignments, supports, strict=True)
+    ]
+    best = int(np.argmax(scores))
+    transform, agreement, support = transforms[best], alignments[best].agreement, supports[best]
     full = AlignmentScorer(x.points(scale, FULL_POINTS), y.points(scale, FULL_POINTS))
     if refine == "icp":
         transform = full.refine(transform)
@@ -105,7 +117,7 @@ def register(
     overlap, rmse = full.overlap_and_rmse(transform)
     rows = [cloud.rows[m] for cloud, m in zip((x, y), hypotheses.matches.T, strict=True)]
     return Registration(
-        transform=_to_original_units(transform, scale, x.centre, y.centre),
+        transform=to_original_units(transform, scale, x.centre, y.centre),
         matches=np.stack(rows, 1),
         match_confidence=hypotheses.confidence,
         match_agrees=hypotheses.match_support(transforms[best], *subsamples) > 0,
@@ -141,6 +153,8 @@ class Cloud:
         Raises:
             CorrmatError: see `register`.
         """
+        if isinstance(cloud, str | Path):
+            raise CorrmatError(f"{name}: points are needed; corrmat.read_scan reads a file")
         values = np.asarray(cloud, np.float64)
         if values.ndim != 2 or values.shape[1] not in (3, 6):
             raise CorrmatError(f"{name}: array of shape {values.shape}, not (N, 3) or (N, 6)")
@@ -264,7 +278,7 @@ def to_json(registration: Registration) -> str:
     return json.dumps({"transform": registration.transform.tolist(), **values}, indent=1) + "\n"
 
 
-def _to_original_units(
+def to_original_units(
     transform: np.ndarray, scale: float, centre_x: np.ndarray, centre_y: np.ndarray
 ) -> np.ndarray:
     """Convert a transform of centred, scaled clouds to the user's coordinates."""

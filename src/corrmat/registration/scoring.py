@@ -1,10 +1,25 @@
 """Refinement and scoring of a transform by how well it aligns two clouds."""
 
 import functools
+from typing import NamedTuple
 
 import numpy as np
 import small_gicp
 from scipy.spatial import KDTree
+
+
+class Alignment(NamedTuple):
+    """How well two clouds lie on each other; both numbers are means over the two clouds.
+
+    agreement: in [0, 1]. A point counts the more, the nearer the nearest point of the other cloud
+        is and the more parallel their normals are, whose signs are unknown.
+    coherence: in [0, 0.25], the variance of "has a near point in the other cloud" that a linear
+        function of the position explains. Two scans of one thing share a region, so that under
+        the true transform the near points lie on one side; under a wrong one they are scattered.
+    """
+
+    agreement: float
+    coherence: float
 
 
 class AlignmentScorer:
@@ -50,23 +65,29 @@ class AlignmentScorer:
         )
         return np.asarray(result.T_target_source)
 
-    def agreement(self, transform: np.ndarray) -> float:
-        """Score in [0, 1] how much of either cloud lies on the other, surface along surface.
-
-        A point counts the less the farther away the nearest point of the other cloud is, and the
-        more the two normals differ, whose sign is unknown.
-        """
+    def alignment(self, transform: np.ndarray) -> Alignment:
+        """Measure how well a transform (4, 4) puts the clouds on each other."""
         normals, target_normals = self._normals
         moved = normals @ transform[:3, :3].T
         (distance, index), (back_distance, back_index) = self._nearest(transform)
-        scores = [
-            np.clip(1 - (d / self.max_distance) ** 2, 0, None) @ np.abs((a * b).sum(1)) / len(d)
-            for d, a, b in (
-                (distance, moved, target_normals[index]),
-                (back_distance, target_normals, moved[back_index]),
-            )
-        ]
-        return float(np.mean(scores))
+        sides = (
+            (distance, moved, target_normals[index], self._axes[0]),
+            (back_distance, target_normals, moved[back_index], self._axes[1]),
+        )
+        agreements, coherences = [], []
+        for d, a, b, axes in sides:
+            closeness = np.clip(1 - (d / self.max_distance) ** 2, 0, None)
+            agreements.append(closeness @ np.abs((a * b).sum(1)) / len(d))
+            near = d < self.max_distance
+            coherences.append(np.square((near - near.mean()) @ axes).sum() / len(d))
+        return Alignment(float(np.mean(agreements)), float(np.mean(coherences)))
+
+    @functools.cached_property
+    def _axes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Orthonormal bases (N, 3) and (M, 3) of the linear functions of a point's position."""
+        centred = [cloud - cloud.mean(0) for cloud in (self.source, self.target)]
+        source, target = (np.linalg.svd(c, full_matrices=False)[0] for c in centred)
+        return source, target
 
     def overlap_and_rmse(self, transform: np.ndarray) -> tuple[float, float]:
         """Compute the share of source points with a target point near, and their RMS distance.
