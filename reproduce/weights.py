@@ -4,9 +4,7 @@ Only what was trained at laptop scale on the embedded shapes is shipped; `make w
 checks that everything runs.
 """
 
-from pathlib import Path
-
 from corrmat.cli import train_weights
 
 if __name__ == "__main__":
-    train_weights(Path(__file__).resolve().parents[1] / "configs" / "weights.yaml")
+    train_weights()

@@ -29,9 +29,9 @@ def load(identity, scale="smoke"):
 def test_a_recorded_arm_is_shipped_and_loads_by_name(tmp_path, monkeypatch):
     monkeypatch.setattr(weights, "SHIPPED", tmp_path / "shipped" / "corrmat.safetensors")
     loaded, results, runs = load("1.2"), tmp_path / "results", tmp_path / "runs"
-    assert shipping.ship(loaded, results, runs) == []  # no record, nothing to ship
+    assert shipping.ship_arms(loaded, results, runs) == []  # no record, nothing to ship
     experiment.run(loaded, results, runs, "none")
-    assert shipping.ship(loaded, results, runs) == ["1.2/DCP", "1.2/DCP_corr"]
+    assert shipping.ship_arms(loaded, results, runs) == ["1.2/DCP", "1.2/DCP_corr"]
     assert weights.shipped_models() == ["1.2/DCP", "1.2/DCP_corr"]
     network = corrmat.load_model("1.2/DCP_corr")
     checkpoint = runs / loaded.place / "DCP_corr" / "best.ckpt"
@@ -43,7 +43,7 @@ def test_a_recorded_arm_is_shipped_and_loads_by_name(tmp_path, monkeypatch):
     with pytest.raises(CorrmatError, match="neither corrmat, 1.2/DCP, 1.2/DCP_corr"):
         corrmat.load_model("1.2/PCRNet")
     monkeypatch.setattr(shipping, "_shipped_scale", lambda model: recipe.SCALES.index("laptop"))
-    assert shipping.ship(loaded, results, runs) == []  # weights of a larger scale are kept
+    assert shipping.ship_arms(loaded, results, runs) == []  # weights of a larger scale are kept
 
 
 SLOW = ("2.1", "2.3")  # the same network as 2.2's, half a second a pair

@@ -10,7 +10,9 @@ if TYPE_CHECKING:
     from corrmat import losses, methods, metrics
     from corrmat.data.datamodule import RegistrationDataModule
     from corrmat.data.pairs import PairSettings, make_pairs
+    from corrmat.data.scans import read_scan
     from corrmat.errors import CorrmatError
+    from corrmat.ops.correspondence import SoftCorrespondence
     from corrmat.registration.pose_graph import ScanPose, register_scans
     from corrmat.registration.register import Registration, register
     from corrmat.types import PairBatch, Prediction
@@ -25,6 +27,7 @@ __all__ = [
     "Registration",
     "RegistrationDataModule",
     "ScanPose",
+    "SoftCorrespondence",
     "export_model",
     "load_model",
     "load_reference",
@@ -32,6 +35,7 @@ __all__ = [
     "make_pairs",
     "methods",
     "metrics",
+    "read_scan",
     "register",
     "register_scans",
     "shipped_models",
@@ -45,10 +49,12 @@ _MODULES = {
     "RegistrationDataModule": "corrmat.data.datamodule",
     "Registration": "corrmat.registration.register",
     "ScanPose": "corrmat.registration.pose_graph",
+    "SoftCorrespondence": "corrmat.ops.correspondence",
     "export_model": "corrmat.weights",
     "load_model": "corrmat.weights",
     "load_reference": "corrmat.weights",
     "make_pairs": "corrmat.data.pairs",
+    "read_scan": "corrmat.data.scans",
     "register": "corrmat.registration.register",
     "register_scans": "corrmat.registration.pose_graph",
     "shipped_models": "corrmat.weights",

@@ -1,21 +1,108 @@
-"""The command line. Each command calls one function of a wing; options.py parses."""
+"""The command line and the scripts of reproduce/; options.py parses."""
 
 import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from jsonargparse import Namespace
 
 from corrmat.errors import CorrmatError
 from corrmat.options import EXPERIMENT_COMMANDS, SHORT_HELP, build_parser, parse
 
+if TYPE_CHECKING:
+    from corrmat.training.preflight import Arm
+    from corrmat.training.recipe import Recipe
+
 
 def main(words: Sequence[str] | None = None) -> int:
     """Run a command; errors in the input are one line, without a traceback."""
     words = sys.argv[1:] if words is None else list(words)
+    return _exit_code(lambda: _run_command(words))
+
+
+def reproduce(experiment: str) -> None:
+    """Run the experiment of this id with the caller's options: all that reproduce/exp*.py do."""
+    config = _config_folder() / "exp" / f"{experiment}.yaml"
+    sys.exit(main(["run", "--config", str(config), *sys.argv[1:]]))
+
+
+def train_on_ray() -> None:
+    """Train every arm of every experiment on a Ray cluster: reproduce/on_ray.py."""
+
+    def run() -> int:
+        options, configs = _script_options()
+        from corrmat.training import cluster
+
+        cluster.train_all(
+            configs, options.scale, options.overrides, options.runs, options.logger,
+            fresh=options.fresh,
+        )  # fmt: skip
+        return 0
+
+    sys.exit(_exit_code(run))
+
+
+def sweep_rates(experiments: Sequence[str]) -> None:
+    """Choose the rates of these experiments' arms, or of --config's: reproduce/rates.py."""
+
+    def run() -> int:
+        options, configs = _script_options(experiments)
+        from corrmat.training import rates, recipe
+
+        for path in configs:
+            loaded = recipe.load(path, options.scale, options.overrides)
+            rates.sweep(loaded, options.results, options.runs, options.logger, fresh=options.fresh)
+        return 0
+
+    sys.exit(_exit_code(run))
+
+
+def ship_arms() -> None:
+    """Put the trained arms of recorded experiments into the package: reproduce/checkpoints.py."""
+
+    def run() -> int:
+        options, configs = _script_options()
+        from corrmat.training import recipe, shipping
+
+        for path in configs:
+            loaded = recipe.load(path, options.scale, options.overrides)
+            for name in shipping.ship_arms(loaded, options.results, options.runs):
+                print(f"shipped: {name}")
+        return 0
+
+    sys.exit(_exit_code(run))
+
+
+def train_weights() -> None:
+    """Train the weights that `corrmat register` ships: reproduce/weights.py.
+
+    Only weights of the laptop scale, trained on the embedded shapes, are shipped.
+    """
+
+    def run() -> int:
+        words = ["fit", "--config", str(_config_folder() / "weights.yaml"), *sys.argv[1:]]
+        _run_command(words)
+        options = parse(words)
+        from corrmat.registration.shipping import ship
+        from corrmat.training import recipe, runs
+
+        loaded = recipe.load(options.config, options.scale, options.overrides)
+        if (loaded.scale, loaded.data) == ("laptop", "shapes+assemblies"):
+            folder = options.runs / loaded.place / loaded.treatment
+            results = _config_folder().parent / "results"
+            ship(folder / "last.ckpt", runs.trained_facts(folder), results)
+            runs.mark_recorded(folder)  # the next run starts from these weights
+        return 0
+
+    sys.exit(_exit_code(run))
+
+
+def _exit_code(run: Callable[[], int]) -> int:
+    """Call a function; turn what went wrong into a line and an exit code."""
     try:
-        return _run_command(words)
+        return run()
     except CorrmatError as error:
         print(f"corrmat: error: {error}", file=sys.stderr)
         return 2
@@ -30,75 +117,17 @@ def main(words: Sequence[str] | None = None) -> int:
         return 2
 
 
-def reproduce(experiment: str) -> None:
-    """Run the experiment of this id with the caller's options: all that reproduce/*.py do."""
-    sys.exit(main(["run", "--config", str(_config_folder() / f"{experiment}.yaml"), *sys.argv[1:]]))
+def _script_options(experiments: Sequence[str] = ()) -> tuple[Namespace, list[Path]]:
+    """Parse a script's options, those of `run`; list the recipes that it goes through.
 
-
-def train_on_ray() -> None:
-    """Train every arm of every experiment on a Ray cluster: reproduce/on_ray.py."""
-    try:
-        options = parse(["fit", *sys.argv[1:]])
-        from corrmat.training import cluster
-
-        _prepare_output(options)
-        cluster.train_all(
-            sorted(_config_folder().glob("*.yaml")), options.scale, options.overrides,
-            options.runs, options.logger, fresh=options.fresh,
-        )  # fmt: skip
-    except CorrmatError as error:
-        sys.exit(f"corrmat: error: {error}")
-
-
-def sweep_rates(experiments: Sequence[str]) -> None:
-    """Choose the rates of these experiments' arms, or of --config's: reproduce/rates.py."""
-    try:
-        options = parse(["run", *sys.argv[1:]])
-        from corrmat.training import rates, recipe
-
-        _prepare_output(options)
-        paths = [_config_folder() / f"{name}.yaml" for name in experiments]
-        for path in [options.config] if options.config else paths:
-            loaded = recipe.load(path, options.scale, options.overrides)
-            rates.sweep(loaded, options.results, options.runs, options.logger)
-    except CorrmatError as error:
-        sys.exit(f"corrmat: error: {error}")
-
-
-def ship_arms() -> None:
-    """Put the trained arms of recorded experiments into the package: reproduce/checkpoints.py."""
-    try:
-        options = parse(["run", *sys.argv[1:]])
-        from corrmat.training import recipe, shipping
-
-        _prepare_output(options)
-        paths = [options.config] if options.config else sorted(_config_folder().glob("*.yaml"))
-        for path in paths:
-            loaded = recipe.load(path, options.scale, options.overrides)
-            for name in shipping.ship(loaded, options.results, options.runs):
-                print(f"shipped: {name}")
-    except CorrmatError as error:
-        sys.exit(f"corrmat: error: {error}")
-
-
-def train_weights(recipe: Path) -> None:
-    """Train the weights that `corrmat register` ships: reproduce/weights.py.
-
-    Only weights of the laptop scale, trained on the embedded shapes, are shipped.
+    Args:
+        experiments: ids; without any, all of them. --config names one in their place.
     """
-    words = ["fit", "--config", str(recipe), *sys.argv[1:]]
-    code = main(words)
-    if code == 0 and not {"-h", "--help"} & set(words):
-        options = parse(words)
-        from corrmat.registration.shipping import ship
-        from corrmat.training.recipe import load
-        from corrmat.training.runs import trained_facts
-
-        experiment = load(recipe, options.scale, options.overrides)
-        if (experiment.scale, experiment.data) == ("laptop", "shapes+assemblies"):
-            run = options.runs / experiment.place / experiment.treatment
-            ship(run / "last.ckpt", trained_facts(run), recipe.parents[1] / "results")
-    sys.exit(code)
+    options = parse(["run", *sys.argv[1:]])
+    _prepare_output(options)
+    folder = _config_folder() / "exp"
+    listed = [folder / f"{name}.yaml" for name in experiments] or sorted(folder.glob("*.yaml"))
+    return options, [options.config] if options.config else listed
 
 
 def _run_command(words: Sequence[str]) -> int:
@@ -122,14 +151,10 @@ def _run(options: Namespace) -> int:
 
 def _fit(options: Namespace) -> int:
     """Train one arm."""
-    config = _required_config(options)
+    loaded, arm = _prepare_arm(options)
     from corrmat.files import ensure_writable
-    from corrmat.training import console, experiment, preflight, recipe
+    from corrmat.training import console, experiment
 
-    _prepare_output(options)
-    arms = [options.arm] if options.arm else None
-    loaded = recipe.load(config, options.scale, options.overrides, arms)
-    arm = preflight.prepare(loaded.arms[loaded.treatment])
     ensure_writable(options.runs / loaded.place / arm.name)
     with console.Board() as board:
         trained = experiment.train_or_reuse(
@@ -141,15 +166,16 @@ def _fit(options: Namespace) -> int:
 
 def _evaluate(options: Namespace) -> int:
     """Test the checkpoint of one arm."""
-    config = _required_config(options)
+    loaded, arm = _prepare_arm(options)
     from corrmat.metrics import summary
-    from corrmat.training import experiment, fit, preflight, recipe, runs
+    from corrmat.training import experiment, fit, runs
 
-    _prepare_output(options)
-    arms = [options.arm] if options.arm else None
-    loaded = recipe.load(config, options.scale, options.overrides, arms)
-    arm = preflight.prepare(loaded.arms[loaded.treatment])
     checkpoint = options.checkpoint or runs.best_checkpoint(loaded, arm, options.runs)
+    if not checkpoint.is_file():
+        others = options.runs.glob(f"*/{loaded.data}/{loaded.id}/{arm.name}/best.ckpt")
+        scales = ", ".join(sorted(path.relative_to(options.runs).parts[0] for path in others))
+        hint = f"there is one of --scale {scales}" if scales else "train first (corrmat fit)"
+        raise CorrmatError(f"no checkpoint {checkpoint}; {hint}")
     method = fit.load_trained(arm, checkpoint)
     print(f"checkpoint: {checkpoint}")
     tests = fit.score(method, arm, experiment.bands(loaded.bands_deg))
@@ -159,6 +185,17 @@ def _evaluate(options: Namespace) -> int:
         for name, value in summary(per_pair).items():
             print(f"{name:28s} {value:.6g}")
     return 0
+
+
+def _prepare_arm(options: Namespace) -> "tuple[Recipe, Arm]":
+    """Load the recipe with one arm, --arm or its METHOD_corr, and prepare that arm."""
+    config = _required_config(options)
+    from corrmat.training import preflight, recipe
+
+    _prepare_output(options)
+    arms = [options.arm] if options.arm else None
+    loaded = recipe.load(config, options.scale, options.overrides, arms)
+    return loaded, preflight.prepare(loaded.arms[loaded.treatment])
 
 
 def _required_config(options: Namespace) -> Path:
@@ -184,9 +221,14 @@ def _compare(options: Namespace) -> int:
     if options.record is not None:
         ensure_writable(options.record.parent)
     about = {name: options[name] for name in ("protocol", "data", "points")}
+    if options.protocol == "rooms":
+        if options.data != "shapes" or options.root:
+            raise CorrmatError("rooms are procedural: --data and --root go with other protocols")
+        about["data"] = "procedural"
     pairs = benchmark.frozen_pairs(**about, root=options.root, count=options.pairs)
     results = benchmark.compare(pairs, options.models.split(","))
-    print(f"{len(pairs)} pairs")
+    fewer = f", one of each shape: {options.pairs} were asked for"
+    print(f"{len(pairs)} pairs{fewer if len(pairs) < options.pairs else ''}")
     print(benchmark.to_table(results))
     if options.record is not None:
         benchmark.write_results(options.record, results, about | {"pairs": len(pairs)})
@@ -243,7 +285,7 @@ def _register_pair(options: Namespace) -> int:
         replace_text(options.html, registration_page(registration, source, target))
         print(f"page: {options.html}")
     if options.gif is not None:
-        from corrmat.registration.animation import registration_gif  # nor does matplotlib
+        from corrmat.registration.animation import registration_gif  # matplotlib too
 
         replace_bytes(options.gif, registration_gif(registration, source, target))
         print(f"animation: {options.gif}")
@@ -388,8 +430,8 @@ def _completion(options: Namespace) -> int:
 
 
 def _config_folder() -> Path:
-    """Return configs/exp of the checkout whose script is running."""
-    return Path(sys.argv[0]).resolve().parents[1] / "configs" / "exp"
+    """Return configs/ of the checkout whose script is running."""
+    return Path(sys.argv[0]).resolve().parents[1] / "configs"
 
 
 _COMMANDS: dict[str, Callable[[Namespace], int]] = {

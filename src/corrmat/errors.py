@@ -1,4 +1,7 @@
-"""The one error type that users see, and a check that networks share."""
+"""The one error type that users see, and the checks that settings and networks share."""
+
+import dataclasses
+import typing
 
 
 class CorrmatError(Exception):
@@ -14,3 +17,17 @@ def require_positive(**sizes: int) -> None:
     for name, size in sizes.items():
         if size < 1:
             raise ValueError(f"{name} {size} is not positive")
+
+
+def check_choices(settings: object) -> None:
+    """Check the fields of a dataclass whose type is a Literal, which Python itself does not.
+
+    Raises:
+        CorrmatError: a value is none of its choices.
+    """
+    hints = typing.get_type_hints(type(settings))
+    for field in dataclasses.fields(settings):  # pyright: ignore[reportArgumentType]
+        choices = typing.get_args(hints[field.name])
+        value = getattr(settings, field.name)
+        if typing.get_origin(hints[field.name]) is typing.Literal and value not in choices:
+            raise CorrmatError(f"{field.name} = {value!r}; choices: {', '.join(choices)}")

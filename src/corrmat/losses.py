@@ -46,7 +46,10 @@ def correspondence_loss(c: SoftCorrespondence, match: Tensor) -> Tensor:
         match: (B, N) int64, the class of each row; rows without a class are ignored.
 
     Returns:
-        A scalar.
+        A scalar; 0 if no row has a class.
+
+    Raises:
+        ValueError: see `SoftCorrespondence.nll`.
     """
     return c.nll(match).sum() / c.is_class(match).sum().clamp_min(1)
 

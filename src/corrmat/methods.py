@@ -38,7 +38,7 @@ class Method(RegistrationModule):
     """
 
     network_type: ClassVar[type[nn.Module]]
-    paper_optimizer: ClassVar[OptimizerSettings]
+    paper_optimizer: ClassVar[OptimizerSettings] = OptimizerSettings()
     LossSettings: ClassVar[type] = NoSettings
 
     def __init__(

@@ -8,7 +8,7 @@ import torch
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
 
-from corrmat.errors import CorrmatError
+from corrmat.errors import CorrmatError, check_choices
 from corrmat.metrics import RegistrationMetrics, match_accuracy
 from corrmat.types import PairBatch, Prediction
 
@@ -35,6 +35,7 @@ class OptimizerSettings:
     warmup: float = 0.1
 
     def __post_init__(self) -> None:
+        check_choices(self)
         checks = {
             "lr": self.lr > 0,
             "weight_decay": self.weight_decay >= 0,

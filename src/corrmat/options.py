@@ -103,6 +103,7 @@ def parse(words: Sequence[str]) -> Namespace:
         CorrmatError: an option is unknown or missing, or a value is not valid.
     """
     command = words[0] if words and words[0] in EXPERIMENT_COMMANDS else None
+    _check_dotted(words, settings=command is not None)
     parser = build_parser([command] if command else [])
     try:
         parsed = parser.parse_args(list(words))
@@ -118,6 +119,26 @@ def parse(words: Sequence[str]) -> Namespace:
         settings = given[parsed.command].as_dict()
         options.overrides = {k: v for k, v in settings.items() if k in ("seed", "start", *GROUPS)}
     return options
+
+
+def _check_dotted(words: Sequence[str], *, settings: bool) -> None:
+    """Refuse options like --seed.foo, which jsonargparse takes for --seed.
+
+    Args:
+        words: of the command line.
+        settings: whether the command takes the settings of a recipe, which are dotted.
+
+    Raises:
+        CorrmatError: an option is dotted, but is no setting of a recipe.
+    """
+    dotted = [word.split("=")[0] for word in words if word.startswith("--")]
+    dotted = [option for option in dotted if "." in option]
+    if dotted and settings:
+        from corrmat.training.recipe import GROUPS
+
+        dotted = [option for option in dotted if option[2:].split(".")[0] not in GROUPS]
+    if dotted:
+        raise CorrmatError(f"unknown option {dotted[0]}; see corrmat {words[0]} --help")
 
 
 def build_parser(with_settings: Sequence[str] = ()) -> ArgumentParser:
@@ -170,13 +191,15 @@ def build_parser(with_settings: Sequence[str] = ()) -> ArgumentParser:
         )
     )
     export = add(
-        "export", "write shipped weights as a folder for the Hugging Face Hub",
-        "examples:\n  corrmat export mine && hf upload somebody/mine mine\n"
+        "export", "write weights as a folder for the Hugging Face Hub",
+        "examples:\n  corrmat export mine --model best.ckpt && hf upload somebody/mine mine\n"
         "  corrmat register a.ply b.ply --model mine\n"
         "  corrmat register a.ply b.ply --model hf:somebody/mine", "FOLDER",
     )  # fmt: skip
     export.add_argument("folder", type=Path, help="for model.safetensors, config.json, README.md")
-    export.add_argument("--model", default="corrmat", help="corrmat, 1.2/DCP_corr, ...")
+    export.add_argument(
+        "--model", default="corrmat", help="corrmat, 1.2/DCP_corr, ..., or a checkpoint file"
+    )
     example = add("example", "write two scans to try register on", words="FOLDER")
     example.add_argument("folder", type=Path, help="for source.ply, target.ply and truth.json")
     robustness = add("robustness", "figure 2: wrong matches against a wrong rotation vector")

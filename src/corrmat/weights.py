@@ -97,6 +97,7 @@ def load_reference(kind: str, state_dict: Mapping[str, Any], **hparams: Any) -> 
 
 
 _MODEL_FILE = "model.safetensors"  # of a folder, as the Hugging Face Hub has it
+_FRONT = "---\nlibrary_name: corrmat\nlicense: mit\ntags: [point-cloud-registration]\n---\n\n"
 SHIPPED = Path(__file__).parent / "shipped" / "corrmat.safetensors"
 
 
@@ -140,36 +141,45 @@ def shipped_metadata(model: str = "corrmat") -> dict[str, str]:
         return file.metadata()
 
 
-def export_model(model: str, folder: Path) -> None:
-    """Write shipped weights as a folder that the Hugging Face Hub understands.
+def export_model(model: str | Path, folder: str | Path) -> None:
+    """Write weights as a folder that the Hugging Face Hub understands.
 
     They are model.safetensors, config.json and a model card, README.md.
 
     Args:
-        model: "corrmat", or one of `shipped_models`.
+        model: "corrmat", one of `shipped_models`, or a checkpoint of `corrmat fit`.
         folder: to write into; it is made.
 
     Raises:
-        CorrmatError: no such weights are shipped.
+        CorrmatError: there are no such weights.
     """
-    if model != "corrmat" and model not in shipped_models():
-        names = ", ".join(["corrmat", *shipped_models()])
-        raise CorrmatError(f"no shipped model {model!r}; models: {names}")
-    about = shipped_metadata(model)
+    model, folder = str(model), Path(folder)
+    if model == "corrmat" or model in shipped_models():
+        about, content = shipped_metadata(model), _shipped_file(model).read_bytes()
+        card = _model_card(model, about)
+    else:
+        method, hparams, network = checkpoint_network(Path(model))
+        about = {"method": method, "network": json.dumps(hparams)}
+        content = _to_safetensors(network, about)
+        card = _FRONT + f"# {method}\n\n    network = corrmat.load_model(folder)\n"
     config = {"library_name": "corrmat", **about, "network": json.loads(about["network"])}
     folder.mkdir(parents=True, exist_ok=True)
-    replace_bytes(folder / _MODEL_FILE, _shipped_file(model).read_bytes())
+    replace_bytes(folder / _MODEL_FILE, content)
     replace_bytes(folder / "config.json", (json.dumps(config, indent=1) + "\n").encode())
-    replace_bytes(folder / "README.md", _model_card(model, about).encode())
+    replace_bytes(folder / "README.md", card.encode())
+
+
+def _to_safetensors(network: nn.Module, metadata: Mapping[str, str]) -> bytes:
+    state = {name: tensor.contiguous() for name, tensor in network.state_dict().items()}
+    return safetensors.torch.save(state, dict(metadata))
 
 
 def _model_card(model: str, about: Mapping[str, str]) -> str:
     """Write the card of a shipped model, with the Hub's metadata in front."""
-    front = "---\nlibrary_name: corrmat\nlicense: mit\ntags: [point-cloud-registration]\n---\n\n"
     if model == "corrmat":
-        return front + (SHIPPED.parent / "MODEL_CARD.md").read_text("utf-8")
+        return _FRONT + (SHIPPED.parent / "MODEL_CARD.md").read_text("utf-8")
     return (
-        f"{front}# {model}\n\n{about['method']} of experiment {model.split('/')[0]} of "
+        f"{_FRONT}# {model}\n\n{about['method']} of experiment {model.split('/')[0]} of "
         f"*Correspondence Matrices are Underrated* (3DV 2020), reproduced. Its record: "
         f"results/{about['record']}, commit {about['commit']}.\n\n"
         "    network = corrmat.load_model(folder)\n"
@@ -236,10 +246,9 @@ def ship_network(
         about: what else the header says.
     """
     path = _shipped_file(model)
-    state = {name: tensor.contiguous() for name, tensor in network.state_dict().items()}
     metadata = {"method": method, "network": json.dumps(dict(hparams)), **about}
     path.parent.mkdir(parents=True, exist_ok=True)
-    replace_bytes(path, safetensors.torch.save(state, metadata))
+    replace_bytes(path, _to_safetensors(network, metadata))
     return path
 
 

@@ -13,7 +13,7 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 
 from corrmat.data.clouds import CloudSet
 from corrmat.data.pairs import STREAM, Key, PairSettings, Split, generator, make_pairs
-from corrmat.data.registry import load_clouds
+from corrmat.data.registry import DATASETS, load_clouds
 from corrmat.errors import CorrmatError
 from corrmat.types import PairBatch
 
@@ -171,6 +171,12 @@ class RegistrationDataModule(L.LightningDataModule):
         """
         return self._loader("test", replace(self.pairs, stretch=1.0, **changes))
 
+    @property
+    def test_settings(self) -> tuple[object, ...]:
+        """Whatever the test pairs depend on."""
+        shapes = self.data, self.root, self.categories, self.counts["test"], self.seed
+        return *shapes, replace(self.pairs, stretch=1.0)
+
     def state_dict(self) -> dict[str, int]:
         """Return the position in the training data: Lightning saves it in every checkpoint."""
         if self.trainer is None:
@@ -179,7 +185,7 @@ class RegistrationDataModule(L.LightningDataModule):
         # After a whole epoch the next one starts at its beginning.
         return {
             "epoch": self.trainer.current_epoch,
-            "batches": batches % max(1, len(self.train_dataloader())),
+            "batches": batches % max(1, int(self.trainer.num_training_batches)),
         }
 
     def load_state_dict(self, state_dict: dict[str, int]) -> None:
@@ -261,11 +267,16 @@ def data_name(data: str, root: str | None, name: str | None) -> str:
     """Return the folder name of a data set in results/: `name`, or the folder's, or `data`.
 
     Raises:
-        CorrmatError: `name` is no plain name.
+        CorrmatError: `name` is no plain name, or that of another data set.
     """
-    if name is not None and (name != Path(name).name or not name):
+    if name is not None and (name != Path(name).name or name in ("", "..")):
         raise CorrmatError(f"--data.name {name!r} is not the name of one folder")
-    return name or (Path(root).resolve().name if data == "folder" and root else data)
+    called = name or (Path(root).resolve().name if data == "folder" and root else data)
+    if called != data and called in DATASETS:
+        raise CorrmatError(
+            f"{called} is another data set: its records would be overwritten; choose a --data.name"
+        )
+    return called
 
 
 def _already_a_batch(batch: PairBatch) -> PairBatch:

@@ -55,9 +55,17 @@ def load(split: str, count: int | None = None, root: Path | None = None) -> Clou
         raise CorrmatError(f"no folder {root}")
     names, files = find_shapes(root, split)
     if not files:
+        other = "test" if split == "train" else "train"
+        elsewhere = len(find_shapes(root, other)[1])
         raise CorrmatError(
-            f"{root} holds no shape for the {split} split; shapes are {', '.join(SUFFIXES)} files, "
-            "in any of the layouts of README.md (Data)"
+            f"{root} holds no shape for the {split} split"
+            + (
+                f": all {elsewhere} files fell to {other}, which without folders train/ and test/ "
+                "a hash of the path decides; add files, or sort them into those folders"
+                if elsewhere
+                else f"; shapes are {', '.join(SUFFIXES)} files, in any of the layouts of "
+                "README.md (Data)"
+            )
         )
     identity = [
         (f.relative, Path(f.path).stat().st_size, Path(f.path).stat().st_mtime_ns) for f in files

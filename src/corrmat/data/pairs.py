@@ -19,7 +19,7 @@ from torch import Tensor
 from corrmat.data.clouds import CloudSet
 from corrmat.data.normals import estimate_normals
 from corrmat.data.visibility import depth_noise, visible_points
-from corrmat.errors import CorrmatError
+from corrmat.errors import CorrmatError, check_choices
 from corrmat.ops import rigid
 from corrmat.types import MATCH_DISTANCE, PairBatch
 
@@ -74,6 +74,7 @@ class PairSettings:
     stretch: float = 1.0
 
     def __post_init__(self) -> None:
+        check_choices(self)
         checks = {
             "num_points": self.num_points >= 3,
             "rotation_deg": 0 <= self.rotation_deg <= 180,

@@ -21,7 +21,7 @@ SAMPLES = 20_000  # points taken of a mesh's surface
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+").fullmatch
 
 
-def read_scan(path: Path, seed: int = 0) -> np.ndarray:
+def read_scan(path: str | Path, seed: int = 0) -> np.ndarray:
     """Read the points of a file, (N, 3) float64 in its units; a mesh is sampled uniformly.
 
     Parts of a scene are merged; colours and everything else are ignored.
@@ -33,6 +33,7 @@ def read_scan(path: Path, seed: int = 0) -> np.ndarray:
     Raises:
         CorrmatError: the file is missing, empty, of another format, or cut short.
     """
+    path = Path(path)
     kind = path.suffix.lower()
     if kind not in MESHES + CLOUDS:
         formats = ", ".join(name[1:] for name in MESHES + CLOUDS)

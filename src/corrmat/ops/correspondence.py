@@ -26,6 +26,9 @@ class SoftCorrespondence:
         feature_target: F_Y, (B, M, d).
         scale: factor of the dot products, e.g. 1 / sqrt(d).
         outlier: (B, N) logits of the outlier class; None for a matrix without one.
+
+    Raises:
+        ValueError: the shapes do not fit each other.
     """
 
     def __init__(
@@ -35,6 +38,14 @@ class SoftCorrespondence:
         scale: float = 1.0,
         outlier: Tensor | None = None,
     ) -> None:
+        shapes = [tuple(feature_source.shape), tuple(feature_target.shape)]
+        fit = all(len(s) == 3 for s in shapes) and shapes[0][::2] == shapes[1][::2]
+        if not fit or (outlier is not None and tuple(outlier.shape) != shapes[0][:2]):
+            shapes += [] if outlier is None else [tuple(outlier.shape)]
+            raise ValueError(
+                "features must be (B, N, d) and (B, M, d), outlier logits (B, N), not "
+                + ", ".join(map(str, shapes))
+            )
         # Always float32 or wider: bfloat16 logits cannot tell near matches apart.
         self.feature_source = _at_least_float32(feature_source)
         self.feature_target = _at_least_float32(feature_target)
@@ -96,7 +107,8 @@ class SoftCorrespondence:
     def soft_target(self, y: Tensor) -> Tensor:
         """Return the expected match of each source point, (B, N, 3), for y (B, M, 3).
 
-        Y_hat = C Y; with an outlier class, conditional on the point being an inlier.
+        Y_hat = C Y; with an outlier class, conditional on the point being an inlier. Gradients
+        reach the features, not y. The result for one y is kept: do not change y in place.
         """
         total, mean = self._rows(y)
         last = self._vectors[2]
@@ -113,9 +125,27 @@ class SoftCorrespondence:
 
         Returns:
             (B, N) negative log-likelihoods; 0 for ignored rows.
+
+        Raises:
+            ValueError: an index of another shape or, on a CPU, outside -1 to M.
         """
+        self._check(index)
         total, _ = self._rows()
         return torch.where(self.is_class(index), total - self._logit_at(index), 0)
+
+    def _check(self, index: Tensor) -> None:
+        """Check the true matches; their values on a CPU only, where that waits for nothing."""
+        if index.shape != self.feature_source.shape[:2]:
+            raise ValueError(
+                f"true matches of shape {tuple(index.shape)} for features of shape "
+                f"{tuple(self.feature_source.shape)}"
+            )
+        low, high = (-1, self.num_target) if index.is_cuda else map(int, index.aminmax())
+        if low < -1 or high > self.num_target:
+            raise ValueError(
+                f"true matches from {low} to {high} are not rows of {self.num_target} target "
+                f"points, nor {self.num_target} for an outlier or -1 for no match"
+            )
 
     def _logit_at(self, index: Tensor) -> Tensor:
         """Return one logit of each row (B, N); arbitrary where the index is not a class."""
@@ -137,6 +167,7 @@ class _LogCorrespondence(SoftCorrespondence):
 
     def nll(self, index: Tensor) -> Tensor:
         """Return -log C at the true match; see `SoftCorrespondence.nll`."""
+        self._check(index)
         return torch.where(self.is_class(index), -self._logit_at(index), 0)
 
     def weight(self) -> Tensor:

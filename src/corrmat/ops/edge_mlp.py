@@ -216,7 +216,8 @@ class _Layer(torch.autograd.Function):
         (batch, points, k, _), outputs = edges.shape, len(weight)
         out = edges.new_empty(batch, points, k, outputs) if keep else None
         pooled = edges.new_empty(batch, points, outputs) if pool else None
-        winner = edges.new_empty(batch, points, outputs, dtype=torch.int16) if pool else None
+        index = torch.int16 if k <= torch.iinfo(torch.int16).max else torch.int32
+        winner = edges.new_empty(batch, points, outputs, dtype=index) if pool else None
         total = edges.new_zeros(batch, outputs, dtype=torch.float64) if gather else None
         square = torch.zeros_like(total) if total is not None else None
         wide, scratch, norm = _wide(edges), _Scratch(edges), _as_slabs(edges, scale, shift)

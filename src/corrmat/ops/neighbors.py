@@ -44,7 +44,7 @@ def neighbors_at_ranks(points: Tensor, ranks: Tensor) -> Tensor:
     Returns:
         (B, N, *ranks.shape) int64.
     """
-    distance = torch.cdist(points, points)
+    distance = torch.cdist(points, points, compute_mode=_EXACT)
     if distance.device.type == "cpu":  # numpy sorts with vector instructions, torch does not
         order = torch.from_numpy(np.argsort(distance.numpy(), -1))
     else:

@@ -38,8 +38,8 @@ _STYLES: dict[Source, dict[str, Any]] = {
 }
 
 
-class RivalResult(NamedTuple):
-    """Where another arm than the snapshot's puts the source."""
+class BaselineResult(NamedTuple):
+    """Where METHOD puts the source of METHOD_corr's snapshot."""
 
     arm: str
     rotation: list[list[float]]  # (3, 3)
@@ -108,7 +108,7 @@ def _training_panel(record: Record, name: str, xlabel: str = _PAIRS) -> Panel:
     Args:
         record: whose.
         name: of the metric.
-        xlabel: `_PAIRS`, or `_MINUTES`: the arm's own, spread evenly over its pairs.
+        xlabel: `_PAIRS`, or `_MINUTES`: an arm's training time, in proportion to its pairs.
     """
     title, _, factor = METRICS.get(name, ("training loss, share of its start", "", 1))
     series: list[CurveSeries] = []
@@ -118,11 +118,13 @@ def _training_panel(record: Record, name: str, xlabel: str = _PAIRS) -> Panel:
         spent = [pace * point["pairs_seen"] for point in result.curve]
         lengths.append(max(spent, default=1))
         values = [defined(point.get(name)) for point in result.curve]
-        if spent and None not in values:
+        drawn = [(x, y) for x, y in zip(spent, values, strict=True) if y is not None]
+        if drawn:
             # The arms' losses have no unit in common.
-            unit = 1 / values[0] if name == "loss" and values[0] else factor
-            y = [unit * value for value in values if value is not None]
-            series.append(CurveSeries(arm, colour, spent, y))
+            first = drawn[0][1]
+            unit = 1 / first if name == "loss" and first else factor
+            x = [x for x, _ in drawn]
+            series.append(CurveSeries(arm, colour, x, [unit * y for _, y in drawn]))
         final = record.paper[arm].get(name) if arm in record.paper else None
         if spent and final is not None:
             ends = [min(spent[0], spent[-1] / 2), spent[-1]]
@@ -246,7 +248,7 @@ def _draw_bars(axes: Axes, series: list[CurveSeries], controls: Sequence[str]) -
 
 
 def draw_matches(
-    snapshot: PairSnapshot, title: str, path: Path, rival: RivalResult | None = None
+    snapshot: PairSnapshot, title: str, path: Path, baseline: BaselineResult | None = None
 ) -> None:
     """Draw a pair before and after, right matches green, wrong ones orange (figures 8 and 9).
 
@@ -257,20 +259,25 @@ def draw_matches(
         snapshot: the pair.
         title: above the figure.
         path: of the PNG.
-        rival: where another arm puts the source, to be drawn between the two.
+        baseline: where METHOD puts the source, to be drawn between the two.
     """
     view = principal_axes(np.asarray(snapshot.target))
     before, *_, after = stages(_turned(snapshot, view))
     right = f"{100 * match_accuracy(snapshot):.0f} % of the matches are right"
     scenes = [(f"{snapshot.arm}: {right}", before, True)]
-    if rival is not None:
+    if baseline is not None:
         moved, shape = (
-            (np.asarray(c) @ np.asarray(rival.rotation).T + np.asarray(rival.translation)) @ view
+            (np.asarray(c) @ np.asarray(baseline.rotation).T + np.asarray(baseline.translation))
+            @ view
             for c in (snapshot.source, snapshot.clean)
         )
         none = np.zeros(len(moved), bool)
-        scene = Stage(rival.arm, moved, after.target, np.zeros(len(moved), np.int64), none, shape)
-        scenes.append((f"{rival.arm}: {_degrees(rival.rotation_error_deg)} off", scene, False))
+        scene = Stage(
+            baseline.arm, moved, after.target, np.zeros(len(moved), np.int64), none, shape
+        )
+        scenes.append(
+            (f"{baseline.arm}: {_degrees(baseline.rotation_error_deg)} off", scene, False)
+        )
     scenes.append((f"{snapshot.arm}: {_degrees(snapshot.rotation_error_deg)} off", after, True))
     boxes = [_box(_project(np.concatenate([s.shape, s.source, s.target]))) for _, s, _ in scenes]
     widths = [min(max(box[0] / box[1], 1), 3) for box in boxes]  # room for the headings

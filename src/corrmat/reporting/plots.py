@@ -1,12 +1,12 @@
 """Interactive plots of the page, as plotly's plain dictionaries."""
 
-import csv
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from corrmat.reporting.figures import BLUE, GREEN, GREY, RED, arm_colours, grid, panels
+from corrmat.reporting.intervals import read_errors
 from corrmat.reporting.record import Record
 from corrmat.reporting.snapshots import PairSnapshot, Stage, stages, thin
 
@@ -34,7 +34,8 @@ def curves_plot(record: Record) -> Plot:
             label: Plot = {"name": series.label, "showlegend": in_legend}
             line = {"color": series.colour}
             if series.source != "arm":
-                label = {"name": series.label, "mode": "lines", "showlegend": False}
+                mode = "markers" if series.source == "misprint" else "lines"
+                label = {"name": series.label, "mode": mode, "showlegend": False}
                 line["dash"] = "dot" if series.source == "paper" else "dash"
             axes = {"xaxis": f"x{suffix}", "yaxis": f"y{suffix}", "legendgroup": series.arm}
             x, y = ([float(f"{value:.4g}") for value in values] for values in (series.x, series.y))
@@ -52,14 +53,10 @@ def errors_plot(per_pair: Path, record: Record) -> Plot:
         per_pair: per_pair.csv of the record.
         record: names and colours of the arms.
     """
-    errors: dict[str, list[float]] = {}
-    with per_pair.open() as file:
-        for row in csv.DictReader(file):
-            errors.setdefault(row["arm"], []).append(float(row["rotation_error_deg"]))
     colours = arm_colours(record)
     data = []
-    for arm, values in errors.items():
-        quantiles = np.quantile(np.nan_to_num(values, nan=180.0), QUANTILES, method="inverted_cdf")
+    for arm, errors in read_errors(per_pair).items():
+        quantiles = np.quantile(errors.rotation_deg, QUANTILES, method="inverted_cdf")
         style = {"color": colours.get(arm, GREY), "dash": "solid" if arm in colours else "dash"}
         x = [float(f"{max(value, 1e-4):.4g}") for value in quantiles]
         share = (100 * QUANTILES).round(1).tolist()

@@ -141,6 +141,11 @@ class Record:
         """The arms METHOD and METHOD_corr, as far as there are any."""
         return [arm for arm in (self.baseline, self.treatment) if arm is not None]
 
+    @property
+    def as_printed(self) -> dict[str, ArmResult]:
+        """The paper's results, METHOD before METHOD_corr."""
+        return {arm: self.paper[arm] for arm in self.compared if arm in self.paper}
+
     def to_json(self) -> dict[str, object]:
         """Return the dictionary of metrics.json."""
         content: dict[str, object] = {name: getattr(self, name) for name in self.__annotations__}

@@ -47,8 +47,8 @@ def paper_metric(record: Record) -> str:
 def table(record: Record) -> tuple[list[str], list[list[str]]]:
     """Build the table of ours beside the paper's: headings, and a row a metric (and subset)."""
     heads = ["", *record.arms, "ratio", *record.baselines]
-    heads += [*(f"paper {arm}" for arm in record.paper), "paper ratio"]
-    groups = record.arms, record.baselines, record.paper
+    heads += [*(f"paper {arm}" for arm in record.as_printed), "paper ratio"]
+    groups = record.arms, record.baselines, record.as_printed
     rows = [
         row
         for name, (heading, _, _) in METRICS.items()
@@ -117,7 +117,7 @@ def effort(record: Record) -> str:
 
 
 def markdown_summary(records: Sequence[Record]) -> str:
-    """Build the README's table: "METHOD → METHOD_corr", and the paper's row below each id."""
+    """Build a row a record, "METHOD → METHOD_corr", and the paper's row below each experiment."""
     heads = [
         "experiment", "data", "correct matches, %", "rotation error, mean, deg",
         "rotation error, median, deg", "the paper's rotation error, deg", "minutes",
@@ -131,7 +131,7 @@ def markdown_summary(records: Sequence[Record]) -> str:
             start = [f"{identity} {record.family}, {record.scale}", record.data]
             cells = [*start, *_arrows(record, arms), " → ".join(minutes)]
             lines.append(markdown_row(cells))
-        cells = _arrows(same[0], list(same[0].paper.values()))
+        cells = _arrows(same[0], list(same[0].as_printed.values()))
         if any(cells):
             start = [f"{identity} {same[0].family}, as printed", "ModelNet40"]
             lines.append(markdown_row([*start, *cells, ""]))

@@ -100,19 +100,29 @@ def draw_record(folder: Path) -> None:
         snapshot = snapshots[len(snapshots) // 2]
         place = f"{record.scale}, {record.data}"
         title = f"{record.id} {snapshot.arm} ({place}), the {snapshot.rank} pair"
-        rival = _rival(folder, record, snapshot)
-        figures.draw_matches(snapshot, title, folder / "matches.png", rival)
+        baseline = _baseline_result(folder, record, snapshot)
+        figures.draw_matches(snapshot, title, folder / "matches.png", baseline)
 
 
-def _rival(folder: Path, record: Record, snapshot: PairSnapshot) -> figures.RivalResult | None:
+def _baseline_result(
+    folder: Path, record: Record, snapshot: PairSnapshot
+) -> figures.BaselineResult | None:
     """Find where METHOD puts the source of a snapshot of METHOD_corr."""
     with (folder / "per_pair.csv").open(newline="") as file:
-        for row in csv.DictReader(file):
-            if row["arm"] == record.baseline and int(row["shape"]) == snapshot.shape:
-                values = [float(number) for number in row["transform"].split()]
-                rotation = [values[start : start + 3] for start in (0, 3, 6)]
-                error = float(row["rotation_error_deg"])
-                return figures.RivalResult(row["arm"], rotation, values[9:], error)
+        rows = [row for row in csv.DictReader(file) if int(row["shape"]) == snapshot.shape]
+
+    def distance(row: Mapping[str, str]) -> float:
+        return abs(float(row["rotation_error_deg"]) - snapshot.rotation_error_deg)
+
+    # In 1.4 and 2.4 every rotation band has a pair of this shape.
+    own = [row for row in rows if row["arm"] == snapshot.arm]
+    band = min(own, key=distance)["band"] if own else None
+    for row in rows:
+        if (row["arm"], row["band"]) == (record.baseline, band):
+            values = [float(number) for number in row["transform"].split()]
+            rotation = [values[start : start + 3] for start in (0, 3, 6)]
+            error = float(row["rotation_error_deg"])
+            return figures.BaselineResult(row["arm"], rotation, values[9:], error)
     return None
 
 

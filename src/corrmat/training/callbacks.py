@@ -58,7 +58,8 @@ class ValidationHistory(Callback):
         """Count pairs and collect the loss."""
         assert isinstance(outputs, Mapping)
         self.pairs_seen += len(batch) * trainer.world_size
-        self._losses.append(outputs["loss"].detach())
+        # Lightning has divided it by the batches of a step.
+        self._losses.append(outputs["loss"].detach() * trainer.accumulate_grad_batches)
         if trainer.global_step >= trainer.estimated_stepping_batches:
             trainer.should_stop = True  # so that the last weights are validated too
 
@@ -194,6 +195,8 @@ class SaveOnInterrupt(Callback):
         if self.stop_requested and whole_step and not _validation_follows(trainer, batch_idx):
             if trainer.world_size == 1:
                 trainer.save_checkpoint(self.path)
+            for logger in trainer.loggers:
+                logger.save()
             raise KeyboardInterrupt
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from corrmat.baselines import BASELINES, OPTIONAL, UNTRAINED, is_available
 from corrmat.data.datamodule import PairDataset
+from corrmat.errors import CorrmatError
 from corrmat.files import ensure_writable
 from corrmat.losses import CorrespondenceLoss
 from corrmat.metrics import summary
@@ -56,7 +57,7 @@ def run(
     for folder in (results, runs_folder):
         ensure_writable(folder / recipe.place)
     arms = [prepare(settings) for settings in recipe.arms.values()]
-    digest = _check_test_pairs(recipe, arms[0])
+    digest = _check_test_pairs(recipe, arms)
     trained: dict[str, TrainedArm] = {}
     arm_results: dict[str, ArmResult] = {}
     baseline_results: dict[str, ArmResult] = {}
@@ -80,11 +81,12 @@ def run(
                 snapshots = _snapshots(method, arm, tests, recipe)
     if not is_first_process():
         return None
+    treatment = next(arm for arm in arms if arm.name == recipe.treatment)
     for name in recipe.baselines:
         if not is_available(name):
             log.info(f"the baseline {name} is left out: pip install {' '.join(OPTIONAL[name])}")
             continue
-        tests, baseline_results[name] = _test(_baseline(name, arms[-1]), arms[-1], recipe)
+        tests, baseline_results[name] = _test(_baseline(name, treatment), treatment, recipe)
         rows += pair_rows(name, tests)
     record = Record(
         id=recipe.id,
@@ -155,9 +157,20 @@ def bands(edges_deg: Sequence[float]) -> list[dict[str, float]]:
     ] or [{}]
 
 
-def _check_test_pairs(recipe: Recipe, arm: Arm) -> str:
-    """Compute the digest of the test pairs, and warn if the recipe expects another."""
-    digest = arm.datamodule.test_pairs_digest(bands(recipe.bands_deg))
+def _check_test_pairs(recipe: Recipe, arms: Sequence[Arm]) -> str:
+    """Compute the digest of the test pairs, and warn if the recipe expects another.
+
+    Raises:
+        CorrmatError: the arms have different ones, so that nothing could be compared.
+    """
+    first, *others = (arm.datamodule for arm in arms)
+    for arm, datamodule in zip(arms[1:], others, strict=True):
+        if datamodule.test_settings != first.test_settings:
+            raise CorrmatError(
+                f"{arms[0].name} and {arm.name} would be tested on different pairs: their data may "
+                "differ in batch_size, train_shapes and stretch only"
+            )
+    digest = first.test_pairs_digest(bands(recipe.bands_deg))
     if recipe.test_pairs in (None, digest):
         return digest
     message = "the test pairs made here (%s) are not the recipe's (%s): numbers compare with other "

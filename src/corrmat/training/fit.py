@@ -1,7 +1,6 @@
 """Train one arm with Lightning, and score it on the frozen test pairs."""
 
 import logging
-import shutil
 import statistics
 import time
 import warnings
@@ -70,7 +69,7 @@ def train(
         log.info(f"{size:,} parameters, {len(arm.datamodule.clouds('train'))} training shapes")
     if is_first_process():
         if resume_from is None:
-            shutil.rmtree(folder, ignore_errors=True)
+            runs.set_aside(folder, arm)
         runs.start_run(folder, arm)
     else:
         logger, board = "none", None
@@ -139,7 +138,8 @@ def seconds_to_train(arm: Arm) -> float | None:
     settings, trainer = arm.settings, arm.settings.trainer
     steps = trainer.max_steps
     if steps == -1:
-        steps = (trainer.max_epochs or -1) * len(arm.datamodule.train_dataloader())
+        batches = (trainer.max_epochs or -1) * len(arm.datamodule.train_dataloader())
+        steps = batches // trainer.accumulate_grad_batches
     if steps < 0 or trainer.max_time is not None or on_gpu(trainer.accelerator):
         return None
     method = fresh_method(settings)
@@ -156,7 +156,7 @@ def seconds_to_train(arm: Arm) -> float | None:
         method.loss(prediction, batch).backward()
         optimizer.step()
         seconds.append(time.perf_counter() - start)
-    return statistics.median(seconds) * steps
+    return statistics.median(seconds) * steps * trainer.accumulate_grad_batches
 
 
 def load_trained(arm: Arm, checkpoint: Path) -> Method:

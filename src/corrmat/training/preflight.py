@@ -11,6 +11,7 @@ from corrmat.errors import CorrmatError
 from corrmat.methods import METHODS, Method
 from corrmat.training.hardware import count_devices, trainer_options
 from corrmat.training.recipe import ArmSettings
+from corrmat.types import Prediction
 
 
 @dataclass
@@ -137,4 +138,8 @@ def _try_one_batch(method: Method, arm: Arm) -> None:
     batch = dataset.__getitems__([(0, 0)] * 2)
     for training in (True, False):
         method.train(training)
-        method.loss(method(batch.source, batch.target), batch)
+        prediction = method(batch.source, batch.target)
+        if not isinstance(prediction, Prediction):
+            network, returned = (type(x).__name__ for x in (method.network, prediction))
+            raise TypeError(f"{network}.forward must return a corrmat.Prediction, not a {returned}")
+        method.loss(prediction, batch)

@@ -6,9 +6,10 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from corrmat.errors import CorrmatError
 from corrmat.files import ensure_writable, replace_text
-from corrmat.reporting.provenance import commit
 from corrmat.training import loggers
 from corrmat.training.console import Board
 from corrmat.training.experiment import train_or_reuse
@@ -31,10 +32,16 @@ class RateResult:
     rotation_error_deg_mean: float  # on validation, when the short training ends
     loss: float
     pairs_seen: int
+    commit: str | None  # of the code that trained it
 
 
 def sweep(
-    recipe: Recipe, results: Path, runs_folder: Path, logger: loggers.Choice = "csv"
+    recipe: Recipe,
+    results: Path,
+    runs_folder: Path,
+    logger: loggers.Choice = "csv",
+    *,
+    fresh: bool = False,
 ) -> dict[str, list[RateResult]]:
     """Train every arm for a twentieth of its budget at three rates, and write what came out.
 
@@ -45,14 +52,21 @@ def sweep(
         results: folder of records; this one goes to rates/<id>.json.
         runs_folder: folder of checkpoints and logs, resumed where one was interrupted.
         logger: see `loggers.make_loggers`.
+        fresh: train anew what was trained before.
 
     Returns:
         By arm, the results in the order of the rates.
+
+    Raises:
+        CorrmatError: no arm has a rate to choose, or a budget in steps to take a twentieth of.
     """
     ensure_writable(results / FOLDER)
     arms = {n: s for n, s in recipe.arms.items() if s.optimizer.schedule == "onecycle"}
     if not arms:
         raise CorrmatError(f"{recipe.id} at {recipe.scale} scale has no arm with a rate to choose")
+    endless = [name for name, settings in arms.items() if settings.trainer.max_steps < 1]
+    if endless:
+        raise CorrmatError(f"{endless[0]} has no --trainer.max_steps to take a twentieth of")
     place = replace(recipe, id=f"{recipe.id}-rates", networks_of=None)
     swept: dict[str, list[RateResult]] = {}
     with Board() as board:
@@ -61,18 +75,18 @@ def sweep(
             for factor in FACTORS:
                 arm = prepare(_short(settings, factor))
                 log.info(f"\n{recipe.id} {arm.name}")
-                trained = train_or_reuse(place, arm, runs_folder, logger, board)
+                trained = train_or_reuse(place, arm, runs_folder, logger, board, fresh=fresh)
                 last = trained.curve[-1]
                 swept[name].append(
                     RateResult(
-                        arm.settings.optimizer.lr, last[_METRIC], last["loss"], trained.pairs_seen
+                        arm.settings.optimizer.lr, last[_METRIC], last["loss"],
+                        trained.pairs_seen, trained.commit,
                     )
-                )
+                )  # fmt: skip
     content = {
         "id": recipe.id,
         "scale": recipe.scale,
         "data": recipe.data,
-        "commit": commit(),
         "arms": {
             name: {"chosen": chosen(rates), "rates": [vars(rate) for rate in rates]}
             for name, rates in swept.items()
@@ -84,8 +98,9 @@ def sweep(
 
 
 def chosen(rates: list[RateResult]) -> float:
-    """Return the rate with the lowest rotation error on validation."""
-    return min(rates, key=lambda rate: rate.rotation_error_deg_mean).lr
+    """Return the rate with the lowest rotation error on validation; NaN is the highest."""
+    errors = np.array([rate.rotation_error_deg_mean for rate in rates])
+    return rates[int(np.nan_to_num(errors, nan=np.inf).argmin())].lr
 
 
 def _short(settings: ArmSettings, factor: float) -> ArmSettings:

@@ -10,7 +10,7 @@ import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal, cast
+from typing import Any, Literal, cast
 
 import lightning as L
 import yaml
@@ -149,14 +149,14 @@ def load(
     )
 
 
-def add_settings(parser: ArgumentParser, methods: Sequence[str] = tuple(METHODS)) -> None:
+def add_settings(parser: ArgumentParser, methods: Sequence[str] | None = None) -> None:
     """Add the typed settings of arms as options: --seed, --data.*, --network.* and so on.
 
     Args:
         parser: to add to.
-        methods: the options of these methods' networks and losses.
+        methods: the options of these methods' networks and losses; of all by default.
     """
-    classes = [METHODS[name] for name in methods]
+    classes = [METHODS[name] for name in (METHODS if methods is None else methods)]
     parser.add_argument("--seed", type=int, default=0, help="of weights, pairs and held-out shapes")
     parser.add_argument(
         "--start", type=str | None, default=None,
@@ -215,7 +215,7 @@ def _add_union(parser: ArgumentParser, group: str, classes: Sequence[type]) -> N
         for name, parameter in _parameters(other).items():
             if name not in added:
                 parser.add_argument(
-                    f"--{group}.{name}", type=hints[name], default=parameter.default,
+                    f"--{group}.{name}", type=hints.get(name, Any), default=parameter.default,
                     help=f"see {other.__name__}",
                 )  # fmt: skip
                 added.add(name)
@@ -223,15 +223,25 @@ def _add_union(parser: ArgumentParser, group: str, classes: Sequence[type]) -> N
 
 def _parameters(cls: type) -> dict[str, inspect.Parameter]:
     parameters = inspect.signature(cls).parameters
-    return {name: p for name, p in parameters.items() if p.kind is p.POSITIONAL_OR_KEYWORD}
+    kinds = inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY
+    return {name: p for name, p in parameters.items() if p.kind in kinds}
 
 
-def _merge_layers(path: Path, scale: str) -> Settings:
-    """Read a recipe and its base, and lay their scales over them."""
-    experiment = _read(path)
-    base = _read(path.parent / str(experiment["base"])) if "base" in experiment else {}
+def _merge_layers(path: Path, scale: str, above: tuple[Path, ...] = ()) -> Settings:
+    """Read a recipe and lay it over its base, and each one's scale over itself.
+
+    What the paper reports, and which test pairs an experiment has, is no base's to say.
+    """
+    recipe = _read(path)
     merged: Settings = {}
-    for layer in (base, _at_scale(base, scale), experiment, _at_scale(experiment, scale)):
+    if "base" in recipe:
+        base = path.parent / str(recipe["base"])
+        above = (*above, path.resolve())
+        if base.resolve() in above:
+            raise CorrmatError(f"{path}: its base {base} is based on it")
+        merged = _merge_layers(base, scale, above)
+        merged = {k: v for k, v in merged.items() if k not in ("paper", "test_pairs")}
+    for layer in (recipe, _at_scale(recipe, scale)):
         merged = merge(merged, layer)
     return merged
 
@@ -268,7 +278,7 @@ def _roles(
     if sorted(map(str, named)) != sorted(arms):
         raise CorrmatError(
             f"{path}: baseline, treatment and controls name {', '.join(map(str, named))}; "
-            f"the arms are {', '.join(arms)}"
+            f"the arms are {', '.join(arms)}; further arms belong under controls: [...]"
         )
     return {
         "family": str(merged.get("family") or treatment),

@@ -3,6 +3,7 @@
 import json
 import logging
 import pickle
+import shutil
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -49,6 +50,17 @@ def training_settings(arm: Arm) -> str:
         del data[name]
     data["checksum"] = arm.datamodule.clouds("train").checksum()
     return yaml.safe_dump(settings, sort_keys=False)
+
+
+def set_aside(folder: Path, arm: Arm) -> None:
+    """Make room for a run: delete one of the same settings, keep the last one of others."""
+    if not (folder / _SETTINGS).is_file() or _same_settings(folder, arm):
+        shutil.rmtree(folder, ignore_errors=True)
+        return
+    kept = folder.with_name(f"{folder.name}.previous")
+    shutil.rmtree(kept, ignore_errors=True)
+    folder.rename(kept)
+    log.info(f"the run of other settings is kept: {kept}")
 
 
 def start_run(folder: Path, arm: Arm) -> None:
@@ -114,6 +126,14 @@ def best_checkpoint(recipe: Recipe, arm: Arm, runs: Path) -> Path:
         if (folder / "best.ckpt").is_file() and (folder == main or _same_settings(folder, arm)):
             return folder / "best.ckpt"
     return main / "best.ckpt"
+
+
+def recorded_checkpoint(recipe: Recipe, arm: Arm, runs: Path) -> Path | None:
+    """Find the weights that the record of an arm was tested with; None if they are gone."""
+    folder = runs / recipe.place / arm.name
+    checkpoint = folder / "best.ckpt"
+    recorded = (folder / _RECORDED).exists() and _same_settings(folder, arm)
+    return checkpoint if recorded and checkpoint.is_file() else None
 
 
 def _same_settings(folder: Path, arm: Arm) -> bool:

@@ -6,12 +6,12 @@ from corrmat import weights
 from corrmat.reporting.record import read_record
 from corrmat.training.preflight import prepare
 from corrmat.training.recipe import SCALES, Recipe
-from corrmat.training.runs import best_checkpoint
+from corrmat.training.runs import recorded_checkpoint
 
 MAX_PARAMETERS = 2_000_000  # PCRNet's pose network, of 17 MB, is left out
 
 
-def ship(recipe: Recipe, results: Path, runs_folder: Path) -> list[str]:
+def ship_arms(recipe: Recipe, results: Path, runs_folder: Path) -> list[str]:
     """Write the weights of METHOD and METHOD_corr that a record was tested with into the package.
 
     Weights of a larger scale that ship already are kept.
@@ -19,7 +19,8 @@ def ship(recipe: Recipe, results: Path, runs_folder: Path) -> list[str]:
     Args:
         recipe: the experiment.
         results: folder of records; without this one nothing is shipped.
-        runs_folder: folder of checkpoints; arms without one are left out.
+        runs_folder: folder of checkpoints; arms that were not recorded, or were trained anew
+            since, are left out.
 
     Returns:
         Names for `load_model`.
@@ -33,8 +34,8 @@ def ship(recipe: Recipe, results: Path, runs_folder: Path) -> list[str]:
         model = f"{recipe.id}/{name}"
         if model in weights.shipped_models() and _shipped_scale(model) > SCALES.index(recipe.scale):
             continue
-        checkpoint = best_checkpoint(recipe, prepare(settings), runs_folder)
-        if not checkpoint.is_file():
+        checkpoint = recorded_checkpoint(recipe, prepare(settings), runs_folder)
+        if checkpoint is None:
             continue
         _, hparams, network = weights.checkpoint_network(checkpoint)
         if sum(p.numel() for p in network.parameters()) > MAX_PARAMETERS:
