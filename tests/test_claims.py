@@ -144,3 +144,12 @@ def test_growth_over_bands():
     for treatment, verdict in ((flat, "confirmed"), (steep, "contradicted")):
         judged = claims.flat_over_misalignment(evidence(flat, treatment, bands_deg=edges))
         assert judged.verdict == verdict
+
+
+def test_whether_it_still_learns_needs_more_than_a_few_validations():
+    curve = [{"pairs_seen": n, "match_accuracy": 0.5} for n in (100, 200, 300)]
+    few = evidence(drawn(1), errors(np.ones(50), correct=np.full(50, 5.0)), curves=((), curve))
+    assert claims.below_seventy_per_cent(few) is None
+    many = [*curve, {"pairs_seen": 400, "match_accuracy": 0.5}]
+    enough = evidence(drawn(1), errors(np.ones(50), correct=np.full(50, 5.0)), curves=((), many))
+    assert claims.below_seventy_per_cent(enough).verdict == "confirmed"

@@ -175,3 +175,31 @@ def test_how_much_is_printed_is_a_choice(tmp_path):
     assert "step " not in quiet.stdout
     assert quiet.stdout.lstrip().startswith("1.1  full clouds, any rotation")
     assert not list((tmp_path / "runs").glob("**/wandb"))
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["register", "a.ply", "b.ply", "--seed.foo", "3"],
+        ["compare", "icp", "--data.rotation_deg", "60"],
+        ["run", "--config", "x.yaml", "--seed.foo", "3"],
+    ],
+)
+def test_an_option_with_a_made_up_suffix_is_not_taken_for_the_option(words, capsys):
+    assert main(words) == 2
+    assert f"unknown option {words[-2]}" in capsys.readouterr().err
+
+
+def test_rooms_are_of_no_data_set(capsys):
+    assert main(["compare", "icp", "--protocol", "rooms", "--data", "modelnet40"]) == 2
+    assert "rooms are procedural" in capsys.readouterr().err
+
+
+def test_a_checkpoint_of_another_scale_is_named(tmp_path, capsys):
+    words = ["--config", str(ROOT / "configs/exp/1.2.yaml"), "--runs", str(tmp_path)]
+    there = tmp_path / "smoke/shapes/1.2/DCP_corr/best.ckpt"
+    there.parent.mkdir(parents=True)
+    there.touch()
+    options = ["--data.train_shapes", "20", "--data.test_shapes", "8"]
+    assert main(["evaluate", *words, *options]) == 2
+    assert "there is one of --scale smoke" in capsys.readouterr().err

@@ -1,3 +1,4 @@
+import pytest
 import torch
 from twins import cross_entropy_by_one_hot
 
@@ -69,3 +70,21 @@ def test_the_true_transform_has_no_transformation_loss(generator):
     expected = torch.tensor(8 / 9 + 4)
     actual = transformation_loss(turned, translation + 2, rotation, translation)
     torch.testing.assert_close(actual, expected)
+
+
+def test_matches_and_features_that_do_not_fit_are_refused():
+    x, y = torch.randn(2, 5, 4), torch.randn(2, 6, 4)
+    c = SoftCorrespondence(x, y)
+    good = torch.zeros(2, 5, dtype=torch.int64)
+    assert correspondence_loss(c, good) > 0
+    assert correspondence_loss(c, good - 1) == 0  # no row has a class
+    for bad in (good + 7, good - 2):
+        with pytest.raises(ValueError, match="are not rows of 6 target points"):
+            correspondence_loss(c, bad)
+    with pytest.raises(ValueError, match="true matches of shape"):
+        correspondence_loss(c, good[:1])
+    for features in ((x, y[:1]), (x, y[..., :3]), (x[0], y[0])):
+        with pytest.raises(ValueError, match="features must be"):
+            SoftCorrespondence(*features)
+    with pytest.raises(ValueError, match="outlier logits"):
+        SoftCorrespondence(x, y, outlier=torch.zeros(2, 5, 1))

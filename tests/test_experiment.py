@@ -299,9 +299,11 @@ def test_other_settings_do_not_go_on_from_an_old_checkpoint(tmp_path, capsys):
         train(load("1.1").arms["DCP"], tmp_path / "DCP")
     signal.signal(signal.SIGINT, signal.default_int_handler)
     capsys.readouterr()
+    old = (tmp_path / "DCP" / "last.ckpt").read_bytes()
     settings = load("1.1", "--optimizer.lr", "1e-4").arms["DCP"]
     train(settings, tmp_path / "DCP")
     assert "continuing" not in capsys.readouterr().out
+    assert (tmp_path / "DCP.previous" / "last.ckpt").read_bytes() == old  # nothing is lost
 
 
 def test_an_arm_that_was_finished_is_not_trained_again_before_its_record(tmp_path, capsys):
@@ -591,3 +593,28 @@ def test_a_layer_more_than_the_weights_have_changes_nothing():
     with torch.no_grad():
         before, after = (net(pairs.source, pairs.target) for net in (shipped, grown))
     torch.testing.assert_close(after.correspondence.prob(), before.correspondence.prob())
+
+
+def test_the_loss_of_a_curve_is_that_of_its_batches(tmp_path):
+    """Lightning divides a loss by the batches of a step."""
+    options = ["--trainer.max_steps", "2", "--trainer.val_check_interval", "4"]
+    options += ["--optimizer.lr", "1e-9", "--data.train_shapes", "40"]
+    losses = []
+    for batches in ("1", "2"):
+        accumulate = ["--trainer.accumulate_grad_batches", batches]
+        if batches == "1":
+            accumulate += ["--trainer.max_steps", "4"]
+        arm = load("1.1", *options, *accumulate).arms["DCP_corr"]
+        losses.append(train(arm, tmp_path / batches).curve[-1]["loss"])
+    assert losses[0] == pytest.approx(losses[1], rel=1e-3)
+
+
+def test_arms_with_other_test_pairs_are_not_compared(tmp_path):
+    loaded = load("1.2")
+    noisy = recipe.load(
+        ROOT / "configs" / "exp" / "1.2.yaml", "smoke", {"data": {"jitter": 0.1}}
+    ).arms["DCP"]
+    mixed = dataclasses.replace(loaded, arms=loaded.arms | {"DCP": noisy})
+    with pytest.raises(CorrmatError, match="DCP and DCP_corr would be tested on different pairs"):
+        experiment.run(mixed, tmp_path / "results", tmp_path / "runs", "none")
+    assert not list((tmp_path / "runs").glob("**/*.ckpt"))

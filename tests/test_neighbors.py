@@ -72,3 +72,11 @@ def test_neighbors_at_ranks_are_those_of_knn(generator):
     points = torch.randn(2, 30, 3, generator=generator)
     ranks = torch.tensor([[0, 1, 2], [0, 7, 29]])
     assert torch.equal(neighbors_at_ranks(points, ranks), knn(points, 30)[..., ranks])
+
+
+def test_ranks_do_not_depend_on_where_the_cloud_lies(generator):
+    points = torch.randn(1, 300, 3, generator=generator)
+    ranks = torch.arange(8)
+    expected = neighbors_at_ranks(points, ranks)
+    assert torch.equal(expected[0, :, 0], torch.arange(300))
+    assert (neighbors_at_ranks(points + 100, ranks) == expected).float().mean() > 0.999

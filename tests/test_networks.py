@@ -2,6 +2,7 @@ import functools
 
 import pytest
 import torch
+from torch import nn
 from twins import (
     attention,
     neighborhood_net,
@@ -13,6 +14,7 @@ from corrmat.methods import DCP, METHODS, DCPCorr
 from corrmat.networks.attention import Attention, StdNorm, Transformer
 from corrmat.networks.dcp import DCPNetwork
 from corrmat.networks.dgcnn import DGCNN, EdgeConvolution, edge_features
+from corrmat.networks.pointnet import shared_mlp
 from corrmat.networks.ppf import neighborhoods
 from corrmat.networks.rpmnet import NeighborhoodNet
 from corrmat.ops import edge_mlp
@@ -224,3 +226,16 @@ def test_a_step_in_bfloat16_is_near_the_one_in_float32(name, generator):
     assert rough.dtype == torch.float32
     torch.testing.assert_close(rough, exact, rtol=0.05, atol=0.02)
     assert all(p.grad is None or p.grad.isfinite().all() for p in method.parameters())
+
+
+def test_the_maximum_over_very_many_points_has_its_gradient():
+    """Winners do not fit into 16 bits here."""
+    torch.manual_seed(0)
+    layers = shared_mlp((3, 8, 8), functools.partial(nn.GroupNorm, 2))
+    edges = torch.randn(1, 1, 40_000, 3, requires_grad=True)
+    fused = edge_mlp.group_norm_edge_mlp(edges, layers)
+    (grad,) = torch.autograd.grad(fused.sum(), edges)
+    plain = layers(edges.flatten(1, 2).mT).amax(2).unsqueeze(1)
+    torch.testing.assert_close(fused, plain, rtol=1e-4, atol=1e-5)
+    (expected,) = torch.autograd.grad(plain.sum(), edges)
+    torch.testing.assert_close(grad, expected, rtol=1e-3, atol=1e-5)

@@ -130,3 +130,21 @@ def test_what_does_not_go_with_several_scans_is_said(words, message, tmp_path, m
         write_ply(tmp_path / f"{name}.ply", np.random.default_rng(0).random((50, 3)))
     assert main(["register", *words]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_a_stray_point_does_not_widen_what_agrees():
+    cloud = np.random.default_rng(0).normal(size=(500, 3))
+    edges = [pose_graph._Edge(0, 1, np.eye(4), 0.9)]
+    tolerance = pose_graph._PoseGraph([cloud, cloud], edges).tolerance
+    stray = np.vstack([cloud, [[1e3, 0, 0]]])
+    assert pose_graph._PoseGraph([stray, stray], edges).tolerance == pytest.approx(tolerance, 0.02)
+
+
+def test_an_error_names_the_scan_that_it_is_about():
+    cloud = np.random.default_rng(0).normal(size=(50, 3))
+    broken = cloud.copy()
+    broken[3] = np.nan
+    with pytest.raises(CorrmatError, match="scan 2 of 3: 1 points are NaN"):
+        register_scans([cloud, broken, cloud])
+    with pytest.raises(CorrmatError, match="scan 1 of 2: array of shape"):
+        register_scans([np.zeros(4), cloud])

@@ -1,6 +1,7 @@
 """The learning-rate sweep, and that the recipes train at the rates that it chose."""
 
 import json
+import math
 
 import pytest
 from conftest import ROOT
@@ -41,3 +42,18 @@ def test_the_recipes_train_at_the_chosen_rates(path, scale):
 
 def test_there_is_a_sweep_of_every_family():
     assert {"1.2", "2.2", "3.2", "outliers"} <= {path.stem for path in SWEPT}
+
+
+def rate(lr, error):
+    return rates.RateResult(lr, error, 1.0, 100, None)
+
+
+def test_a_rate_whose_error_is_no_number_is_not_chosen():
+    assert rates.chosen([rate(1.0, math.nan), rate(2.0, 5.0), rate(3.0, 9.0)]) == 2.0
+
+
+def test_a_budget_in_epochs_has_no_twentieth(tmp_path):
+    overrides = {"trainer": {"max_epochs": 20}}
+    loaded = recipe.load(ROOT / "configs" / "exp" / "1.2.yaml", "smoke", overrides)
+    with pytest.raises(CorrmatError, match="no --trainer.max_steps"):
+        rates.sweep(loaded, tmp_path, tmp_path)

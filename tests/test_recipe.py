@@ -3,9 +3,11 @@ import torch
 import yaml
 from conftest import ROOT, shared
 
-from corrmat.data.datamodule import RegistrationDataModule
+from corrmat.data.datamodule import RegistrationDataModule, data_name
+from corrmat.data.pairs import PairSettings
 from corrmat.errors import CorrmatError
 from corrmat.methods import METHODS
+from corrmat.module import OptimizerSettings
 from corrmat.training import recipe
 from corrmat.training.experiment import bands
 from corrmat.training.hardware import trainer_options
@@ -246,3 +248,41 @@ def test_no_gpu_without_float64_is_chosen_by_itself(monkeypatch):
     assert trainer_options(settings)["accelerator"] == "auto"
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
     assert trainer_options(settings)["accelerator"] == "cpu"
+
+
+def test_a_base_may_have_a_base(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text(f"base: {ROOT}/configs/exp/1.2.yaml\nid: mine\ndata: {{keep: 0.5}}\n")
+    loaded = recipe.load(path, "smoke")
+    assert list(loaded.arms) == ["DCP", "DCP_corr"]
+    assert loaded.arms["DCP"].data.keep == 0.5
+    assert (loaded.paper, loaded.test_pairs) == ({}, None)  # of 1.2 alone
+    path.write_text("base: mine.yaml\n")
+    with pytest.raises(CorrmatError, match="is based on it"):
+        recipe.load(path, "smoke")
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: PairSettings(sampling="identicall"), "sampling = 'identicall'; choices: ident"),
+        (lambda: PairSettings(corrupted="target"), "corrupted = 'target'; choices: source, both"),
+        (lambda: OptimizerSettings(schedule="cosine"), "schedule = 'cosine'; choices: step"),
+    ],
+)
+def test_a_misspelt_choice_is_refused_in_python_too(build, message):
+    with pytest.raises(CorrmatError, match=message):
+        build()
+
+
+@pytest.mark.parametrize(
+    ("data", "root", "name"), [("folder", "/x/shapes", None), ("shapes", None, "modelnet40")]
+)
+def test_records_of_another_data_set_are_not_overwritten(data, root, name):
+    with pytest.raises(CorrmatError, match="is another data set"):
+        data_name(data, root, name)
+
+
+def test_a_name_is_one_folder():
+    with pytest.raises(CorrmatError, match="not the name of one folder"):
+        data_name("shapes", None, "..")

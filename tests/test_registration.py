@@ -21,6 +21,7 @@ from corrmat.data.shapes.dataset import make_shape
 from corrmat.errors import CorrmatError
 from corrmat.registration import example
 from corrmat.registration import register as registration
+from corrmat.registration.scoring import AlignmentScorer
 from corrmat.registration.view import registration_page
 from corrmat.weights import load_model
 
@@ -400,3 +401,26 @@ def test_the_page_opens_in_a_browser(pair, tmp_path):
 )
 def test_a_verdict_is_a_confidence_in_words(confidence, words):
     assert weights.verdict(confidence, "why") == words
+
+
+def test_a_network_of_ones_own_registers():
+    cloud = make_shape(("test", 3))[0][:200, :3].astype(float)
+    network = load_model()
+    named, given = (corrmat.register(cloud, cloud + 1, model=m) for m in ("corrmat", network))
+    np.testing.assert_array_equal(named.transform, given.transform)
+    assert given.model == "InvariantNetwork"
+    with pytest.raises(CorrmatError, match=r"corrmat.read_scan reads a file"):
+        corrmat.register("a.ply", cloud)
+
+
+def test_points_that_are_near_on_one_side_are_coherent_and_scattered_ones_are_not():
+    rng = np.random.default_rng(0)
+    sphere = rng.normal(size=(2000, 3))
+    sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
+    half, scattered = sphere[sphere[:, 0] > 0], sphere[rng.permutation(2000)[:40]]
+    shared = AlignmentScorer(half, sphere).alignment(np.eye(4))
+    assert 0.05 < shared.coherence <= 0.25
+    assert AlignmentScorer(scattered, sphere).alignment(np.eye(4)).coherence < 0.02
+    same = AlignmentScorer(sphere, sphere).alignment(np.eye(4))
+    assert same.coherence == 0  # all are near: there is nothing to explain
+    assert same.agreement == pytest.approx(1, abs=1e-6)

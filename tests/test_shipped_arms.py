@@ -18,6 +18,7 @@ from corrmat.metrics import RegistrationMetrics
 from corrmat.reporting.intervals import read_errors
 from corrmat.reporting.record import read_record
 from corrmat.training import experiment, recipe, shipping
+from corrmat.training.preflight import prepare
 
 PAIRS = 16  # of a test
 
@@ -121,3 +122,25 @@ def test_what_cannot_be_exported_or_loaded_is_said(tmp_path, monkeypatch):
     hub.hf_hub_download = lambda *_: (_ for _ in ()).throw(OSError())
     with pytest.raises(CorrmatError, match="hf:somebody/mine cannot be downloaded: OSError"):
         corrmat.load_model("hf:somebody/mine")
+
+
+def test_weights_that_the_record_was_not_tested_with_are_not_shipped(tmp_path, monkeypatch):
+    monkeypatch.setattr(weights, "SHIPPED", tmp_path / "shipped" / "corrmat.safetensors")
+    results, runs = tmp_path / "results", tmp_path / "runs"
+    loaded = load("1.2")
+    experiment.run(loaded, results, runs, "none")
+    arm = prepare(load("1.2").arms["DCP_corr"])
+    experiment.train_or_reuse(loaded, arm, runs, "none", fresh=True)  # anew, without a record
+    assert shipping.ship_arms(loaded, results, runs) == ["1.2/DCP"]
+
+
+def test_a_checkpoint_is_exported_as_well(tmp_path):
+    loaded = load("1.2")
+    trained = experiment.train_or_reuse(loaded, prepare(loaded.arms["DCP_corr"]), tmp_path, "none")
+    assert main(["export", str(tmp_path / "mine"), "--model", str(trained.checkpoint)]) == 0
+    mine, theirs = (corrmat.load_model(m) for m in (tmp_path / "mine", trained.checkpoint))
+    state = theirs.state_dict()
+    assert all(torch.equal(value, state[key]) for key, value in mine.state_dict().items())
+    card = (tmp_path / "mine" / "README.md").read_text()
+    assert "DCPCorr" in card
+    assert "3DV" not in card

@@ -171,7 +171,7 @@ def _evaluate(options: Namespace) -> int:
     from corrmat.training import experiment, fit, runs
 
     checkpoint = options.checkpoint or runs.best_checkpoint(loaded, arm, options.runs)
-    if not checkpoint.is_file():
+    if options.checkpoint is None and not checkpoint.is_file():
         others = options.runs.glob(f"*/{loaded.data}/{loaded.id}/{arm.name}/best.ckpt")
         scales = ", ".join(sorted(path.relative_to(options.runs).parts[0] for path in others))
         hint = f"there is one of --scale {scales}" if scales else "train first (corrmat fit)"

@@ -41,6 +41,17 @@ def ship(checkpoint: Path, facts: Mapping[str, Any], results: Path) -> None:
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, trained on {pairs:,} pairs")
 
 
+def recalibrate() -> None:
+    """Fit the confidence of the shipped weights anew, after a change of how they are used."""
+    about = weights.shipped_metadata()
+    calibration, recalls = calibrate("corrmat")
+    method, network = about.pop("method"), json.loads(about.pop("network"))
+    about["calibration"] = json.dumps(calibration)
+    path = weights.ship_network("corrmat", method, network, weights.load_model(), **about)
+    shares = ", ".join(f"{name} {recall:.0%}" for name, recall in recalls.items())
+    print(f"{path}: calibrated; within 5 degrees on validation: {shares}")
+
+
 def add_training(results: Path, run: dict[str, object]) -> None:
     """Add a training run to results/register/training.json."""
     path = results / "register" / "training.json"
