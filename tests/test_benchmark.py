@@ -116,6 +116,15 @@ def test_the_training_of_the_shipped_weights_is_drawn(tmp_path):
     assert "real +7.0, views +1.0, clean -2.0." in comparisons.doubling_summary(tmp_path)
 
 
+def test_the_table_of_the_choice_has_a_row_for_all_weights(tmp_path):
+    assert comparisons.choice_table(tmp_path) == "No choice is recorded."
+    tried = {"0.0, 0.0": {"recall_5deg": 0.5, "recall_adds": 0.25}}
+    path = tmp_path / "register" / "choice.json"
+    path.parent.mkdir()
+    path.write_text(json.dumps({"real": {"pairs": 8, "weights": tried}}))
+    assert "| 0.0, 0.0 | 50.0%, 25.0% |" in comparisons.choice_table(tmp_path)
+
+
 def test_fragments_of_a_room_overlap_in_part_and_lie_on_each_other():
     pair, again = (make_room_pair(3, 2000, "test") for _ in range(2))
     np.testing.assert_array_equal(pair.source, again.source)

@@ -12,6 +12,7 @@ from sybil import Sybil
 from sybil.parsers.markdown import PythonCodeBlockParser
 
 from corrmat.data.shapes import dataset
+from corrmat.methods import METHODS, DCPCorr
 from corrmat.networks.dcp import DCPNetwork
 from corrmat.options import parse
 from corrmat.weights import load_reference
@@ -31,6 +32,7 @@ def test_python_blocks_are_executed(page, tmp_path, monkeypatch):
     np.save("source.npy", cloud)
     np.save("target.npy", cloud[::-1] + 0.5)
     monkeypatch.setattr("corrmat.load_reference", any_reference)
+    monkeypatch.setitem(METHODS, "MineCorr", DCPCorr)  # a block names its own so: restored after
     monkeypatch.setattr(torch, "load", loader_without_the_authors_file(torch.load))
     for example in document.examples():
         example.evaluate()

@@ -1,6 +1,11 @@
 """docs/architecture.md's recipes of steps, each followed as a newcomer would."""
 
 import dataclasses
+import json
+import os
+import re
+import subprocess
+import sys
 from dataclasses import dataclass
 
 import lightning as L
@@ -8,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from conftest import ROOT
 from torch import nn
 
 from corrmat import RegistrationDataModule
@@ -96,6 +102,19 @@ def mine(monkeypatch, tmp_path):
         return recipe.load(path, "smoke")
 
     return load
+
+
+def test_the_method_of_architecture_md_runs(tmp_path, monkeypatch):
+    """The file and the recipe, as they stand there."""
+    text = (ROOT / "docs" / "architecture.md").read_text()
+    section = text[text.index("## A method of your own") :]
+    for name, kind in (("mine.py", "python"), ("mine.yaml", "yaml")):
+        (tmp_path / name).write_text(re.search(f"```{kind}\n(.*?)```", section, re.DOTALL)[1])
+    words = ["run", "--config", "mine.yaml", "--scale", "smoke", "--logger", "none"]
+    environment = {**os.environ, "CORRMAT_CACHE": str(tmp_path / "cache")}
+    subprocess.run([sys.executable, "mine.py", *words], cwd=tmp_path, env=environment, check=True)
+    record = tmp_path / "results/smoke/shapes/mine/metrics.json"
+    assert json.loads(record.read_text())["treatment"] == "MineCorr"
 
 
 def test_a_method_a_data_set_and_a_loss_setting_of_ones_own_leave_a_record(mine, tmp_path):

@@ -53,8 +53,10 @@ def results(tmp_path):
             snapshots = [view | {"rank": rank} for rank in ("easiest", "median", "hardest")]
             (folder / "snapshots.json").write_text(json.dumps(snapshots))
         (folder / "metrics.json").write_text(json.dumps(content))
-        rows = ["arm,rotation_error_deg", "DCP,30", "DCP,20", "DCP_corr,1", "DCP_corr,nan"]
-        (folder / "per_pair.csv").write_text("\n".join(rows))
+        errors = ("DCP", 30), ("DCP", 20), ("DCP_corr", 1), ("DCP_corr", "nan")
+        rows = [f"{arm},0,{error},,8" for arm, error in errors]
+        head = "arm,band,rotation_error_deg,num_correct,num_matchable"
+        (folder / "per_pair.csv").write_text("\n".join([head, *rows]))
     robustness.run(root / "smoke" / "robustness", draws=2)
     return root
 

@@ -1,12 +1,13 @@
 import json
 import re
 import subprocess
+from types import SimpleNamespace
 
 import pytest
 from conftest import ROOT
 
 from corrmat.errors import CorrmatError
-from corrmat.reporting import documents, figures, matrices, overview, tables
+from corrmat.reporting import documents, figures, matrices, overview, tables, writer
 from corrmat.reporting.record import Record
 
 RECORD = {
@@ -221,3 +222,39 @@ def test_the_matrices_of_the_shipped_arms_are_drawn(tmp_path):
     assert drawn is not None
     assert drawn.startswith(b"\x89PNG")
     assert matrices.draw_matrices(tmp_path) is None
+
+
+def test_the_drawn_baseline_is_of_the_band_of_the_snapshot(tmp_path):
+    """In 1.4 and 2.4 every band has a pair of each shape."""
+    snapshot = SimpleNamespace(arm="DCP_corr", shape=3, rotation_error_deg=2.00001)
+    transform = " ".join(["1", "0", "0", "0", "1", "0", "0", "0", "1", "0", "0", "{}"])
+    rows = [
+        ("DCP", 0, 3, 8.0, 0), ("DCP", 1, 3, 170.0, 1), ("DCP", 1, 4, 60.0, 2),
+        ("DCP_corr", 0, 3, 9.0, 3), ("DCP_corr", 1, 3, 2.0, 4),
+    ]  # fmt: skip
+    lines = [f"{a},{b},{s},{e},{transform.format(z)}" for a, b, s, e, z in rows]
+    head = "arm,band,shape,rotation_error_deg,transform"
+    (tmp_path / "per_pair.csv").write_text("\n".join([head, *lines]))
+    result = writer._baseline_result(tmp_path, Record.from_json(RECORD), snapshot)
+    assert result.rotation_error_deg == 170
+    assert result.translation == [0, 0, 1]
+
+
+def test_the_papers_ratio_does_not_depend_on_the_order_in_the_recipe():
+    paper = dict(reversed(RECORD["paper"].items()))
+    heads, rows = tables.table(Record.from_json(RECORD | {"paper": paper}))
+    assert heads[-3:] == ["paper DCP", "paper DCP_corr", "paper ratio"]
+    assert rows[0][-1] == "0.0551"
+
+
+def test_a_curve_leaves_out_an_undefined_validation():
+    record = json.loads(json.dumps(RECORD).replace("NaN", "null"))
+    point = record["arms"]["DCP_corr"]["curve"][0]
+    record["arms"]["DCP_corr"]["curve"] = [
+        point | {"pairs_seen": n, "match_accuracy": share}
+        for n, share in ((8, 0.1), (16, None), (24, 0.3))
+    ]
+    panels = figures.panels(Record.from_json(record))
+    panel = next(panel for panel in panels if "matches" in panel.title)
+    (series,) = [s for s in panel.series if s.arm == "DCP_corr" and s.source == "arm"]
+    assert series.x == [8, 24]

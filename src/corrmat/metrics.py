@@ -15,7 +15,7 @@ from corrmat.ops.neighbors import gather_points, nearest
 from corrmat.types import PairBatch, Prediction
 
 RECALL_DEG, RECALL_UNITS = 5.0, 0.05
-ADDS_THRESHOLD = 0.03  # of the radius: mean distance of aligned clean clouds (ADD-S)
+ADDS_THRESHOLD = 0.03  # mean distance of aligned clean clouds (ADD-S): radii, or metres in rooms
 
 
 def rotation_error_deg(rotation_pred: Tensor, rotation: Tensor) -> Tensor:
@@ -224,8 +224,7 @@ class RegistrationMetrics(Metric):
 def summary(per_pair: dict[str, Tensor]) -> dict[str, float]:
     """Summarise many pairs: angles in degrees, lengths in units of the unit sphere.
 
-    A pair without a finite prediction counts in `failed`, makes means NaN and is a miss in
-    recall.
+    A pair without a finite rotation counts in `failed`, makes means NaN and is a miss in recall.
     """
     angle, shift = per_pair["rotation_error_deg"], per_pair["translation_error"]
     relative, naive = per_pair["relative_euler_error_deg"], per_pair["naive_euler_error_deg"]

@@ -21,7 +21,7 @@ _INDEX = "index.json"  # written last: a folder without it is not complete
 class ShardedRows:
     """Rows (S, P, 6) in .npy shards, of which only the requested ones are read.
 
-    Reading a shape is one `pread` of some 50 KB. The operating system caches the files, so that
+    Reading a shape is one read of some 50 KB. The operating system caches the files, so that
     memory of the process does not grow with the data set, and any number of DataLoader workers
     share one copy.
     """

@@ -13,7 +13,7 @@ from corrmat.data.shapes.solids import box, merged
 NOISE_M = 0.005  # standard deviation of every coordinate
 OVERLAP = (0.3, 0.7)  # share of the source's area that the target shows too
 _WALL_M, _HEIGHT_M = 0.1, 2.5
-_SAMPLES_PER_POINT = 8  # of the whole room, a point of a fragment
+_SAMPLES_PER_POINT = 8  # samples of the whole room for each point of a fragment
 # Furniture: longest side in metres.
 _SIZES = {
     "bathtub": (1.5, 1.8), "bed": (1.9, 2.2), "bench": (1.0, 1.6), "bookshelf": (1.5, 2.2),

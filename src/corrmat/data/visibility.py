@@ -31,7 +31,7 @@ def depth_noise(points: np.ndarray, camera: np.ndarray, noise: np.ndarray) -> np
     Args:
         points: (N, 3).
         camera: (3,) its position.
-        noise: (N, 3), whose first column is used; it is kept at the distance of the origin.
+        noise: (N, 3), whose first column is used; at the distance of the origin it is not scaled.
 
     Returns:
         (N, 3) offsets.

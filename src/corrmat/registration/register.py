@@ -258,7 +258,12 @@ def to_text(registration: Registration) -> str:
     if len(registration.matches):
         agree, matches = registration.match_agrees.sum(), len(registration.matches)
         lines.append(f"matches      {agree} of {matches} agree with the transform")
-    lines += [f"confidence   {registration.confidence:.0%}", f"verdict      {registration.verdict}"]
+    fitted = registration.model in ("corrmat", *CLASSICAL)
+    doubt = "" if fitted else "  (fitted to the shipped weights, not to this model)"
+    lines += [
+        f"confidence   {registration.confidence:.0%}{doubt}",
+        f"verdict      {registration.verdict}",
+    ]
     return "\n".join(
         [*lines, f"({registration.model}, seed {registration.seed}, {registration.seconds:.2f} s)"]
     )

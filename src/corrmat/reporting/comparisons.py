@@ -71,6 +71,23 @@ def networks_table(results: Path) -> str:
     return "\n".join(lines)
 
 
+def choice_table(results: Path) -> str:
+    """Build the table of weights that were tried for the choice among candidates."""
+    path = results / "register" / "choice.json"
+    if not path.is_file():
+        return "No choice is recorded."
+    record = json.loads(path.read_text())
+    protocols = [name for name in _PROTOCOLS if name in record]
+    heads = ["weights of coherence, support", *protocols]
+    lines = [markdown_row(heads), "|" + "---|" * len(heads)]
+    for weights in record[protocols[0]]["weights"]:
+        tried = [record[name]["weights"][weights] for name in protocols]
+        shares = [f"{row['recall_5deg']:.1%}, {row['recall_adds']:.1%}" for row in tried]
+        lines.append(markdown_row([weights, *shares]))
+    counts = ", ".join(f"{record[name]['pairs']} {name}" for name in protocols)
+    return "\n".join([*lines, "", f"{counts} pairs."])
+
+
 def confidence_table(results: Path) -> str:
     """Build the table of what the confidence promised and how often the clouds were aligned.
 

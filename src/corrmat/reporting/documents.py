@@ -17,6 +17,7 @@ from corrmat.reporting.claims import (
     read_evidence,
 )
 from corrmat.reporting.comparisons import (
+    choice_table,
     comparison_summary,
     comparison_table,
     confidence_table,
@@ -167,6 +168,7 @@ TABLES: tuple[tuple[str, str, Callable[[Results], str]], ...] = (
     ("docs/reproduction.md", "tables", lambda results: markdown_tables(results.records)),
     ("docs/claims.md", "claims", lambda results: markdown_claims(results.claims)),
     ("docs/register.md", "comparison", lambda results: comparison_table(results.folder)),
+    ("docs/register.md", "choice", lambda results: choice_table(results.folder)),
     ("docs/register.md", "networks", lambda results: networks_table(results.folder)),
     ("docs/register.md", "doubling", lambda results: doubling_summary(results.folder)),
     ("docs/register.md", "confidence", lambda results: confidence_table(results.folder)),

@@ -14,7 +14,7 @@ COLUMNS = 4
 
 
 def longest_records(records: Sequence[Record]) -> list[Record]:
-    """Choose one record of each experiment: of most training pairs, on the embedded shapes first.
+    """Choose the record of each experiment with most training pairs; of equals, that on shapes.
 
     Records of the smoke scale and of other seeds than 0 are left out.
     """

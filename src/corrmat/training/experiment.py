@@ -141,7 +141,7 @@ def _time_to_train(arm: Arm) -> str:
     """Say how long an arm trains on this machine, as far as a timed step tells."""
     seconds = seconds_to_train(arm)
     if seconds is None:
-        return "trains on a GPU, or without a last step: no estimate"
+        return "trains on a GPU, or until it is stopped: no estimate"
     return f"about {max(seconds / 60, 0.1):.2g} min of training on this machine"
 
 
