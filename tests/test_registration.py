@@ -14,7 +14,7 @@ from conftest import shared
 from PIL import Image
 
 import corrmat
-from corrmat import weights
+from corrmat.calibration import verdict
 from corrmat.cli import main
 from corrmat.data.scans import read_scan, write_ply
 from corrmat.data.shapes.dataset import make_shape
@@ -400,7 +400,7 @@ def test_the_page_opens_in_a_browser(pair, tmp_path):
     ],
 )
 def test_a_verdict_is_a_confidence_in_words(confidence, words):
-    assert weights.verdict(confidence, "why") == words
+    assert verdict(confidence, "why") == words
 
 
 def test_a_network_of_ones_own_registers():

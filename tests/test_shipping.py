@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from corrmat import load_model, weights
+from corrmat.calibration import shipped_calibration
 from corrmat.methods import InvariantCorr
 from corrmat.registration import shipping
 
@@ -45,7 +46,7 @@ def test_a_checkpoint_becomes_the_weights_of_the_package(checkpoint, package, tm
     (run,) = json.loads((tmp_path / "results" / "register" / "training.json").read_text())
     assert (run["before"], run["pairs"], run["curve"]) == (before, before + 400, [{"loss": 1.0}])
     assert set(run["validation"]) == {"real", "views", "clean"}
-    calibration = weights.shipped_calibration()
+    calibration = shipped_calibration()
     assert (len(calibration.both), len(calibration.agreement)) == (3, 2)
     assert 0 < calibration.confidence(0.5, 0.5) < 1
     trained, shipped = load_model(checkpoint).state_dict(), load_model().state_dict()

@@ -9,11 +9,9 @@ import json
 import pickle
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
-import numpy as np
 import safetensors
 import safetensors.torch
 import torch
@@ -250,46 +248,6 @@ def ship_network(
     path.parent.mkdir(parents=True, exist_ok=True)
     replace_bytes(path, _to_safetensors(network, metadata))
     return path
-
-
-SURE, LIKELY = 0.9, 0.5  # least confidence of the verdicts "aligned" and "probably aligned"
-
-
-def verdict(confidence: float, reason: str) -> str:
-    """Put a confidence into words, with the reason unless they are "aligned"."""
-    if confidence >= SURE:
-        return "aligned"
-    return f"{'probably aligned' if confidence >= LIKELY else 'doubtful'}: {reason}"
-
-
-@dataclass(frozen=True)
-class Calibration:
-    """Logistic curves from the scores of a registration to the chance that it is right.
-
-    Coefficients are over (agreement, support, 1), and over (agreement, 1) for models without
-    matches; `registration.shipping.calibrate` fits them.
-    """
-
-    both: list[float]
-    agreement: list[float]
-
-    def confidence(self, agreement: float, support: float | None) -> float:
-        """Compute the chance that a registration is right.
-
-        Args:
-            agreement: of the two clouds, in [0, 1].
-            support: of the matches, in [0, 1]; None for a model without matches.
-        """
-        if support is None:
-            logit = np.dot(self.agreement, [agreement, 1.0])
-        else:
-            logit = np.dot(self.both, [agreement, support, 1.0])
-        return float(1 / (1 + np.exp(-logit)))
-
-
-def shipped_calibration() -> Calibration:
-    """Read the calibration of the shipped weights."""
-    return Calibration(**json.loads(shipped_metadata()["calibration"]))
 
 
 def _read_checkpoint(path: Path) -> Mapping[str, Any]:

@@ -11,9 +11,9 @@ from rich.progress import track
 from scipy.spatial.transform import Rotation
 from torch import nn
 
+from corrmat.calibration import verdict
 from corrmat.errors import CorrmatError
 from corrmat.registration.register import Cloud, Refine, matrix_lines, register
-from corrmat.weights import verdict
 
 _SWEEPS = 50  # of averaging; poses settle within ten
 # How far a registration may be off the poses to agree with them: in degrees, and as a share of the

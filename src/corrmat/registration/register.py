@@ -10,11 +10,12 @@ from typing import Literal
 import numpy as np
 from torch import nn
 
+from corrmat.calibration import Calibration, shipped_calibration, verdict
 from corrmat.data.normals import estimate_normals
 from corrmat.errors import CorrmatError
 from corrmat.registration.hypotheses import CLASSICAL, HypothesisGenerator, NetworkHypotheses
 from corrmat.registration.scoring import AlignmentScorer
-from corrmat.weights import Calibration, load_model, shipped_calibration, verdict
+from corrmat.weights import load_model
 
 Refine = Literal["icp", "none"]
 MODEL_POINTS = 1024  # points of either cloud for the model

@@ -63,7 +63,7 @@ def add_training(results: Path, run: dict[str, object]) -> None:
 def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:
     """Fit the chance that a pair is aligned to its agreement and support.
 
-    Logistic regression on validation pairs of three difficulties; `weights.Calibration` applies it.
+    Logistic regression on validation pairs of three difficulties; `Calibration` applies it.
 
     Args:
         model: as `register` takes it.

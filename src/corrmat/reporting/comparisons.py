@@ -9,10 +9,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, NullLocator
 from scipy import stats
 
+from corrmat.calibration import shipped_calibration, verdict
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG
 from corrmat.reporting.figures import BLUE, GREEN, RED, save
 from corrmat.reporting.tables import markdown_row
-from corrmat.weights import shipped_calibration, verdict
 
 OURS = "corrmat"
 _PROTOCOLS = ("real", "views", "clean", "rooms")  # in the order of the tables
