@@ -1,5 +1,7 @@
 """The tables of `corrmat register`: every model on every protocol, into results/register.
 
+Networks of the experiments in the shipped one's place make networks.json.
+
 make protocols ROOT=folder-of-modelnet40
 """
 
@@ -11,22 +13,28 @@ from corrmat.cli import main
 
 RESULTS = Path(__file__).resolve().parents[1] / "results" / "register"
 MODELS = "corrmat,ransac,ransac17,fgr,kiss,icp"
+NETWORKS = "corrmat,2.2/RPMNet_corr,outliers/DCP_corr"
 POINTS = {"real": (512, 1024), "views": (512,), "clean": (512, 1024)}
 
 
 def run(root: Path | None) -> None:
     """Evaluate and record each of them; the real data only where they are at hand."""
+    compare(NETWORKS, "networks", [])
     for data in ("shapes", *(("modelnet40",) if root else ())):
         for protocol, sizes in POINTS.items():
             for points in sizes:
                 name = f"{protocol}-{data}-{points}"
-                print(f"\n{name}")
-                words = [MODELS, "--protocol", protocol, "--data", data, "--points", str(points)]
+                words = ["--protocol", protocol, "--data", data, "--points", str(points)]
                 words += ["--root", str(root)] if data == "modelnet40" else []
-                path = RESULTS / f"{name}.json"
-                code = main(["compare", *words, "--record", str(path)])
-                if code:
-                    sys.exit(code)
+                compare(MODELS, name, words)
+
+
+def compare(models: str, name: str, words: list[str]) -> None:
+    """Compare models and write the record of this name."""
+    print(f"\n{name}")
+    code = main(["compare", models, *words, "--record", str(RESULTS / f"{name}.json")])
+    if code:
+        sys.exit(code)
 
 
 if __name__ == "__main__":

@@ -65,7 +65,7 @@ def networks_table(results: Path) -> str:
     lines = [markdown_row(["network", "recall at 5 deg", "recall ADD-S"]), "|---|---|---|"]
     for name, row in json.loads(path.read_text())["models"].items():
         parts = Path(name).parts
-        label = f"{parts[-2]}, experiment {parts[-3]}" if len(parts) > 2 else f"{name} (shipped)"
+        label = f"{parts[-1]}, experiment {parts[-2]}" if len(parts) > 1 else f"{name} (shipped)"
         recalls = [f"{row['recall_5deg']:.0%}", f"{row['recall_adds']:.0%}"]
         lines.append(markdown_row([label, *recalls]))
     return "\n".join(lines)
