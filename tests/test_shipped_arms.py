@@ -100,7 +100,7 @@ def test_an_exported_model_is_loaded_from_its_folder_and_from_the_hub(model, tmp
 
 
 def test_what_cannot_be_exported_or_loaded_is_said(tmp_path, monkeypatch):
-    with pytest.raises(CorrmatError, match="no shipped model '1.2/DPC'; models: corrmat, 1.1/"):
+    with pytest.raises(CorrmatError, match="no model '1.2/DPC': neither corrmat, 1.1/"):
         weights.export_model("1.2/DPC", tmp_path)
     safetensors.torch.save_file({"x": torch.zeros(1)}, tmp_path / "model.safetensors")
     with pytest.raises(CorrmatError, match="is no model of corrmat"):
@@ -142,5 +142,5 @@ def test_a_checkpoint_is_exported_as_well(tmp_path):
     state = theirs.state_dict()
     assert all(torch.equal(value, state[key]) for key, value in mine.state_dict().items())
     card = (tmp_path / "mine" / "README.md").read_text()
-    assert "DCPCorr" in card
+    assert "DCP_corr" in card
     assert "3DV" not in card

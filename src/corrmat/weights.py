@@ -156,7 +156,10 @@ def export_model(model: str | Path, folder: str | Path) -> None:
         about, content = shipped_metadata(model), _shipped_file(model).read_bytes()
         card = _model_card(model, about)
     else:
-        method, hparams, network = checkpoint_network(Path(model))
+        name, hparams, network = checkpoint_network(Path(model))
+        from corrmat.methods import METHODS  # imports Lightning, as `checkpoint_network` does
+
+        method = next(key for key, cls in METHODS.items() if cls.__name__ == name)
         about = {"method": method, "network": json.dumps(hparams)}
         content = _to_safetensors(network, about)
         card = _FRONT + f"# {method}\n\n    network = corrmat.load_model(folder)\n"

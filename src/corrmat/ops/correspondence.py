@@ -140,7 +140,9 @@ class SoftCorrespondence:
                 f"true matches of shape {tuple(index.shape)} for features of shape "
                 f"{tuple(self.feature_source.shape)}"
             )
-        low, high = (-1, self.num_target) if index.is_cuda else map(int, index.aminmax())
+        if index.device.type != "cpu" or not index.numel():
+            return
+        low, high = index.numpy().min(), index.numpy().max()
         if low < -1 or high > self.num_target:
             raise ValueError(
                 f"true matches from {low} to {high} are not rows of {self.num_target} target "

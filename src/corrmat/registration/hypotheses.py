@@ -181,7 +181,7 @@ def kiss(
 def ransac17(
     source: np.ndarray, target: np.ndarray, seed: int, settings: FpfhSettings = FPFH_RANSAC
 ) -> Hypotheses:
-    """Return as many hypotheses of RANSAC as the network has: one from each of seventeen seeds."""
+    """Return seventeen hypotheses of RANSAC: one from each of as many seeds."""
     seeds = range(17 * seed, 17 * (seed + 1))
     return Hypotheses(fpfh_ransac(source, target, seeds, settings), *_NO_MATCHES)
 

@@ -13,7 +13,7 @@ from corrmat.reporting.snapshots import PairSnapshot, Stage, stages, thin
 Plot = dict[str, object]
 """A plotly figure: `data` and `layout`."""
 QUANTILES = np.linspace(0, 1, 51)
-_MAX_POINTS, _MAX_LINES = 70, 36  # drawn of a cloud, of the matches: the page stays small
+_MAX_POINTS, _MAX_LINES = 60, 30  # drawn of a cloud, of the matches: the page stays small
 
 
 def curves_plot(record: Record) -> Plot:
