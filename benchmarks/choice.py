@@ -25,6 +25,7 @@ from corrmat.registration.register import (
     MODEL_POINTS,
     SELECTION_POINTS,
     Cloud,
+    measure_candidates,
     to_original_units,
 )
 from corrmat.registration.scoring import AlignmentScorer
@@ -62,16 +63,10 @@ def candidates(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> np.
     x, y = Cloud.of(source, "source", 0), Cloud.of(target, "target", 0)
     scale = 2 * MEDIAN / (x.median + y.median)
     scorer = AlignmentScorer(x.points(scale, SELECTION_POINTS), y.points(scale, SELECTION_POINTS))
-    rows = []
-    subsamples = [cloud.with_normals(scale, MODEL_POINTS) for cloud in (x, y)]
-    hypotheses = generate(*subsamples, 0)
-    for transform in hypotheses.transforms:
-        refined = scorer.refine(transform)
-        support = hypotheses.support(refined, *subsamples)
-        in_units = to_original_units(refined, scale, x.centre, y.centre)
-        errors = benchmark.errors(pairs, index, in_units)
-        rows.append([*scorer.alignment(refined), support, *errors])
-    return np.array(rows)
+    subsamples = x.with_normals(scale, MODEL_POINTS), y.with_normals(scale, MODEL_POINTS)
+    transforms, measures = measure_candidates(generate(*subsamples, 0), subsamples, scorer)
+    in_units = [to_original_units(t, scale, x.centre, y.centre) for t in transforms]
+    return np.hstack([measures, [benchmark.errors(pairs, index, t) for t in in_units]])
 
 
 def recalls(tables: list[np.ndarray], weights: tuple[float, float] | None) -> dict[str, float]:

@@ -3,7 +3,13 @@
 import torch
 from conftest import random_rotation
 
-from corrmat.ops.ransac import ransac
+from corrmat.ops.ransac import best_by_matches, fit_triples
+
+
+def ransac(x, y, weight, inlier_threshold, *, generator, count=8):
+    """What `NetworkHypotheses` does with matches."""
+    given = x, y, weight, inlier_threshold
+    return best_by_matches(*fit_triples(*given, generator=generator), *given, count)
 
 
 def matches(generator, count=200, wrong=0.7, noise=0.01):

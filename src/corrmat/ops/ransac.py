@@ -12,44 +12,6 @@ _SAME_ROTATION = math.cos(math.radians(10))  # closer rotations count as one hyp
 
 
 @torch.no_grad()
-def ransac(
-    x: Tensor,
-    y: Tensor,
-    weight: Tensor,
-    inlier_threshold: float,
-    *,
-    generator: torch.Generator,
-    draws: int = 20000,
-    fits: int = 1000,
-    count: int = 8,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Find the rigid transforms that most of the matches agree on.
-
-    All hypotheses are evaluated at once, as a batch. A transform scores the weight of the matches
-    that it explains, each less the larger its residual (MSAC, Torr & Zisserman 2000). The best
-    distinct transforms are refitted to the matches that they explain.
-
-    Args:
-        x: (K, 3) source points of K matches, at least three.
-        y: (K, 3) their targets.
-        weight: (K,) weight of each match; also its probability of being drawn.
-        inlier_threshold: largest residual of a match, in units of the points.
-        generator: random generator of the draws.
-        draws: triples drawn.
-        fits: transforms fitted to the triples that are left.
-        count: transforms returned at most.
-
-    Returns:
-        Rotations (T, 3, 3), translations (T, 3) and scores (T,), best first; T = 0 if no triple
-        of matches is rigid, or no match has a weight.
-    """
-    rotation, translation = fit_triples(
-        x, y, weight, inlier_threshold, generator=generator, draws=draws, fits=fits
-    )
-    return best_by_matches(rotation, translation, x, y, weight, inlier_threshold, count)
-
-
-@torch.no_grad()
 def fit_triples(
     x: Tensor,
     y: Tensor,
@@ -60,14 +22,24 @@ def fit_triples(
     draws: int = 20000,
     fits: int = 1000,
 ) -> tuple[Tensor, Tensor]:
-    """Fit rigid transforms to random triples of matches; see `ransac`.
+    """Fit rigid transforms to random triples of matches, all as one batch.
 
     Triples whose triangles differ in a side by more than the threshold cannot be rigid, and
     triangles with a side below twice the threshold fix no rotation: both are dropped before
     anything is fitted.
 
+    Args:
+        x: (K, 3) source points of K matches, at least three.
+        y: (K, 3) their targets.
+        weight: (K,) weight of each match; also its probability of being drawn.
+        inlier_threshold: largest residual of a match, in units of the points.
+        generator: random generator of the draws.
+        draws: triples drawn.
+        fits: transforms fitted to the triples that are left.
+
     Returns:
-        Rotations (F, 3, 3) and translations (F, 3), in the order of the draws.
+        Rotations (F, 3, 3) and translations (F, 3), in the order of the draws; F = 0 if no triple
+        of matches is rigid, or no match has a weight.
     """
     x, y, weight = x.double(), y.double(), weight.double()
     if not (weight > 0).any():
@@ -92,10 +64,22 @@ def best_by_matches(
     inlier_threshold: float,
     count: int,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Select the transforms (F, 3, 3), (F, 3) that explain most matches, and refit them to those.
+    """Select the distinct transforms that most of the matches agree on, and refit them.
+
+    A transform scores the weight of the matches that it explains, each less the larger its
+    residual (MSAC, Torr & Zisserman 2000). The best are refitted to the matches that they explain.
+
+    Args:
+        rotation: (F, 3, 3).
+        translation: (F, 3).
+        x: as of `fit_triples`, and so are `y`, `weight` and `inlier_threshold`.
+        y: (K, 3).
+        weight: (K,).
+        inlier_threshold: in units of the points.
+        count: transforms returned at most.
 
     Returns:
-        As `ransac`.
+        Rotations (T, 3, 3), translations (T, 3) and scores (T,), best first.
     """
     if not len(rotation):
         return rotation, translation, translation.new_empty(0)

@@ -13,7 +13,12 @@ from torch import nn
 from corrmat.calibration import Calibration, shipped_calibration, verdict
 from corrmat.data.normals import estimate_normals
 from corrmat.errors import CorrmatError
-from corrmat.registration.hypotheses import CLASSICAL, HypothesisGenerator, NetworkHypotheses
+from corrmat.registration.hypotheses import (
+    CLASSICAL,
+    Hypotheses,
+    HypothesisGenerator,
+    NetworkHypotheses,
+)
 from corrmat.registration.scoring import AlignmentScorer
 from corrmat.weights import load_model
 
@@ -99,17 +104,9 @@ def register(
     subsamples = x.with_normals(scale, MODEL_POINTS), y.with_normals(scale, MODEL_POINTS)
     hypotheses = generate(*subsamples, seed)
     scorer = AlignmentScorer(x.points(scale, SELECTION_POINTS), y.points(scale, SELECTION_POINTS))
-    transforms = hypotheses.transforms
-    if refine == "icp":
-        transforms = np.stack([scorer.refine(transform) for transform in transforms])
-    alignments = [scorer.alignment(transform) for transform in transforms]
-    supports = [hypotheses.support(transform, *subsamples) for transform in transforms]
-    scores = [
-        alignment.agreement + COHERENCE_WEIGHT * alignment.coherence + SUPPORT_WEIGHT * support
-        for alignment, support in zip(alignments, supports, strict=True)
-    ]
-    best = int(np.argmax(scores))
-    transform, agreement, support = transforms[best], alignments[best].agreement, supports[best]
+    transforms, measures = measure_candidates(hypotheses, subsamples, scorer, refine)
+    best = int(np.argmax(measures @ [1.0, COHERENCE_WEIGHT, SUPPORT_WEIGHT]))
+    transform, (agreement, _, support) = transforms[best], measures[best].tolist()
     full = AlignmentScorer(x.points(scale, FULL_POINTS), y.points(scale, FULL_POINTS))
     if refine == "icp":
         transform = full.refine(transform)
@@ -132,6 +129,30 @@ def register(
         seed=seed,
         seconds=time.perf_counter() - start,
     )
+
+
+def measure_candidates(
+    hypotheses: Hypotheses,
+    subsamples: tuple[np.ndarray, np.ndarray],
+    scorer: AlignmentScorer,
+    refine: Refine = "icp",
+) -> tuple[np.ndarray, np.ndarray]:
+    """Refine the hypotheses, and measure what the choice among them weighs.
+
+    Args:
+        hypotheses: of the transform.
+        subsamples: the clouds that they were made from.
+        scorer: of the clouds to refine and measure them on.
+        refine: as for `register`.
+
+    Returns:
+        Transforms (T, 4, 4); and (T, 3): agreement, coherence, support.
+    """
+    transforms = hypotheses.transforms
+    if refine == "icp":
+        transforms = np.stack([scorer.refine(transform) for transform in transforms])
+    measures = [(*scorer.alignment(t), hypotheses.support(t, *subsamples)) for t in transforms]
+    return transforms, np.array(measures)
 
 
 class Cloud:

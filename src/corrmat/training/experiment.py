@@ -163,9 +163,9 @@ def _check_test_pairs(recipe: Recipe, arms: Sequence[Arm]) -> str:
     Raises:
         CorrmatError: the arms have different ones, so that nothing could be compared.
     """
-    first, *others = (arm.datamodule for arm in arms)
-    for arm, datamodule in zip(arms[1:], others, strict=True):
-        if datamodule.test_settings != first.test_settings:
+    first = arms[0].datamodule
+    for arm in arms[1:]:
+        if arm.datamodule.test_settings != first.test_settings:
             raise CorrmatError(
                 f"{arms[0].name} and {arm.name} would be tested on different pairs: their data may "
                 "differ in batch_size, train_shapes and stretch only"
