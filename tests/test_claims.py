@@ -131,7 +131,8 @@ def test_the_verdicts_are_counted():
     claim = claims.Claim("", "", "", "", "confirmed")
     other = dataclasses.replace(claim, verdict="not shown")
     assert claims.count_verdicts([claim, other, claim]) == (
-        "2 confirmed, 0 confirmed in direction, 1 not shown, 0 contradicted"
+        "2 confirmed, 0 confirmed in direction, 1 not shown, 0 contradicted "
+        "(3 verdicts on 1 claims)"
     )
 
 
@@ -144,6 +145,19 @@ def test_growth_over_bands():
     for treatment, verdict in ((flat, "confirmed"), (steep, "contradicted")):
         judged = claims.flat_over_misalignment(evidence(flat, treatment, bands_deg=edges))
         assert judged.verdict == verdict
+
+
+def test_the_last_quarter_of_a_training_is_a_quarter_of_its_pairs():
+    """3.1 on shapes: 4,800 pairs, six validations; between the last two lies a sixth."""
+    matches = (0.195, 0.27, 0.294, 0.354, 0.395, 0.402)
+    curve = [
+        {"pairs_seen": 800 * (n + 1), "match_accuracy": share} for n, share in enumerate(matches)
+    ]
+    treatment = errors(np.ones(50), correct=np.full(50, 4.0))
+    judged = claims.below_seventy_per_cent(evidence(drawn(1), treatment, curves=((), curve)))
+    assert judged is not None
+    assert judged.verdict == "not shown"
+    assert "2.8 points" in judged.ours
 
 
 def test_whether_it_still_learns_needs_more_than_a_few_validations():

@@ -7,7 +7,11 @@ from corrmat.data.datamodule import RegistrationDataModule
 from corrmat.losses import correspondence_loss
 from corrmat.networks.dcp import DCPNetwork
 from corrmat.networks.matching import MATCHING_HEADS
-from corrmat.ops.correspondence import SoftCorrespondence, outlier_feature
+from corrmat.ops.correspondence import (
+    MatchabilityCorrespondence,
+    SoftCorrespondence,
+    outlier_feature,
+)
 from corrmat.ops.rigid import procrustes
 from corrmat.types import Prediction
 
@@ -47,6 +51,28 @@ def test_features_of_zero_have_a_finite_outlier():
     feature.sum().backward()
     assert (feature == 0).all()
     assert f_y.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("logit", [8.0, 18.0, 60.0])
+@pytest.mark.parametrize("log_matrix", [False, True])
+def test_an_all_but_certain_outlier_still_has_an_expected_match(log_matrix, logit, generator):
+    """In float32, 1 - p_outlier has no digits left; the mean over target points has all of them."""
+    f_x, f_y = (f.detach() for f in features(generator))
+    y = torch.randn(2, 9, 3, generator=generator, dtype=torch.float64)
+    found = {}
+    for dtype in (torch.float32, torch.float64):
+        x = f_x.to(dtype).requires_grad_()
+        out = torch.full((2, 7), logit, dtype=dtype)
+        c = (
+            MatchabilityCorrespondence(x, f_y.to(dtype), 0.25, -out, torch.zeros(2, 9, dtype=dtype))
+            if log_matrix
+            else SoftCorrespondence(x, f_y.to(dtype), 0.25, out)
+        )
+        matched = c.soft_target(y.to(dtype))
+        (gradient,) = torch.autograd.grad(matched.square().sum(), x, retain_graph=True)
+        found[dtype] = matched, gradient, c.weight().log(), c.nll(torch.zeros(2, 7).long())
+    for single, double in zip(found[torch.float32], found[torch.float64], strict=True):
+        torch.testing.assert_close(single.double(), double, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("way", WAYS)

@@ -63,13 +63,16 @@ class SoftCorrespondence:
         return self.scale * self.feature_source, self.feature_target, self.outlier
 
     def _rows(self, y: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Compute the log-sum-exp of the rows and the means of y under their softmax; cached."""
+        """Compute log-sum-exp and mean of y of the rows, over target points alone; cached.
+
+        The outlier class stays apart: beside one of probability 1 the rest would round to zero.
+        """
         cached = self.__dict__.get("_cached_rows")
         if cached is None or (y is not None and cached[0] is not y):
-            a, b, last = self._vectors
+            a, b, _ = self._vectors
             values = b[..., :0] if y is None else y.to(b.dtype)
             with torch.autocast(a.device.type, enabled=False):
-                cached = y, *softmax_rows(a, b, values.detach(), last)
+                cached = y, *softmax_rows(a, b, values.detach())
             self._cached_rows = cached
         return cached[1:]
 
@@ -100,9 +103,7 @@ class SoftCorrespondence:
     def weight(self) -> Tensor:
         """Return the probability of not being an outlier, (B, N) in [0, 1]: 1 - p_outlier."""
         total, _ = self._rows()
-        if self.outlier is None:
-            return torch.ones_like(total)
-        return 1 - (self.outlier - total).exp()
+        return torch.ones_like(total) if self.outlier is None else (total - self.outlier).sigmoid()
 
     def soft_target(self, y: Tensor) -> Tensor:
         """Return the expected match of each source point, (B, N, 3), for y (B, M, 3).
@@ -110,11 +111,7 @@ class SoftCorrespondence:
         Y_hat = C Y; with an outlier class, conditional on the point being an inlier. Gradients
         reach the features, not y. The result for one y is kept: do not change y in place.
         """
-        total, mean = self._rows(y)
-        last = self._vectors[2]
-        if last is None:
-            return mean
-        return mean / (1 - (last - total).exp()).unsqueeze(-1).clamp_min(1e-20)
+        return self._rows(y)[1]
 
     def nll(self, index: Tensor) -> Tensor:
         """Return the cross-entropy of each row against its true match (paper section 4, L_CE).
@@ -131,6 +128,8 @@ class SoftCorrespondence:
         """
         self._check(index)
         total, _ = self._rows()
+        if self.outlier is not None:
+            total = torch.logaddexp(total, self.outlier)
         return torch.where(self.is_class(index), total - self._logit_at(index), 0)
 
     def _check(self, index: Tensor) -> None:
@@ -174,8 +173,7 @@ class _LogCorrespondence(SoftCorrespondence):
 
     def weight(self) -> Tensor:
         """Return the sum of each row over target points, (B, N) in [0, 1]."""
-        total, last = self._rows()[0], self._vectors[2]
-        return total.exp() - (0 if last is None else last.exp())
+        return self._rows()[0].exp()
 
 
 class SinkhornCorrespondence(_LogCorrespondence):

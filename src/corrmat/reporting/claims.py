@@ -280,10 +280,11 @@ def _high_rate_control(record: Record) -> str | None:
 def below_seventy_per_cent(evidence: Evidence) -> Claim | None:
     """PCRNet_corr "could not achieve" 70 % of correct matches on 1024 points."""
     share, record = match_accuracy(evidence.treatment), evidence.record
-    curve = [point["match_accuracy"] for point in record.arms[record.treatment].curve]
+    curve = record.arms[record.treatment].curve
     if len(curve) < 4:  # too few to tell whether it still learns
         return None
-    gain = curve[-1] - curve[-1 - len(curve) // 4]
+    pairs, matches = np.array([(p["pairs_seen"], p["match_accuracy"]) for p in curve]).T
+    gain = matches[-1] - np.interp(0.75 * pairs[-1], pairs, matches)
     verdict: Verdict = "contradicted" if share.low > MOST_MATCHES else "not shown"
     if share.high < MOST_MATCHES and gain < STILL_LEARNING:
         verdict = "confirmed"
@@ -362,9 +363,10 @@ def _judge(record: Record, results: Path) -> list[Claim]:
 
 
 def count_verdicts(claims: Sequence[Claim]) -> str:
-    """Say how many verdicts of the ledger are of each kind."""
+    """Say how many verdicts of the ledger are of each kind, and on how many claims."""
     counts = Counter(claim.verdict for claim in claims)
-    return ", ".join(f"{counts[verdict]} {verdict}" for verdict in get_args(Verdict))
+    kinds = ", ".join(f"{counts[verdict]} {verdict}" for verdict in get_args(Verdict))
+    return f"{kinds} ({len(claims)} verdicts on {len({claim.words for claim in claims})} claims)"
 
 
 def verdicts(record: Record, results: Path) -> str:
