@@ -23,6 +23,7 @@ from corrmat.registration import example
 from corrmat.registration import register as registration
 from corrmat.registration.scoring import AlignmentScorer
 from corrmat.registration.view import registration_page
+from corrmat.types import Prediction
 from corrmat.weights import load_model
 
 BROWSER = next(
@@ -141,6 +142,7 @@ LINE = np.arange(50.0)[:, None] * np.array([1.0, 2.0, 3.0])
         (LINE + 1e6, "all points lie on one line; the rotation is not determined"),
         (GRID[:, :2], r"array of shape \(64, 2\)"),
         (np.vstack([np.zeros((99, 3)), GRID - 1.5]), "most points are equal"),
+        (np.array([[0, 0, 0], [1, 0, 0], [0, 1e3, 0]]), "2 points are left without the stray ones"),
         (np.hstack([GRID, 255 * GRID]), "no unit normals .one has length 1.33e.03"),
     ],
 )
@@ -364,6 +366,8 @@ def test_classical_pipelines_give_a_motion(pair, model):
     result = corrmat.register(source, target, model=model)
     assert result.transform.shape == (4, 4)
     assert np.linalg.det(result.transform[:3, :3]) == pytest.approx(1, abs=1e-6)
+    seeded = [corrmat.register(source, target, model=model, seed=2**40).transform for _ in range(2)]
+    np.testing.assert_allclose(*seeded, atol=1e-6)
 
 
 def test_without_open3d_the_classical_pipelines_say_what_to_install(pair, monkeypatch):
@@ -409,8 +413,43 @@ def test_a_network_of_ones_own_registers():
     named, given = (corrmat.register(cloud, cloud + 1, model=m) for m in ("corrmat", network))
     np.testing.assert_array_equal(named.transform, given.transform)
     assert given.model == "InvariantNetwork"
+    wrapped = torch.nn.Module()
+    wrapped.network = network  # as a LightningModule has it
+    assert corrmat.register(cloud, cloud + 1, model=wrapped).confidence == given.confidence
     with pytest.raises(CorrmatError, match=r"corrmat.read_scan reads a file"):
         corrmat.register("a.ply", cloud)
+
+
+class Fixed(torch.nn.Module):
+    """Predicts one transform, and has a part that is not a network."""
+
+    def __init__(self, value):
+        super().__init__()
+        self.network = torch.nn.Linear(1, 1)
+        self.frozen = torch.nn.Linear(1, 1).eval()
+        self.value = value
+
+    def forward(self, source, target):
+        assert not self.training
+        return Prediction(self.value * torch.eye(3)[None], torch.zeros(1, 3))
+
+
+def test_a_network_keeps_its_mode_and_must_not_predict_nonsense():
+    network = Fixed(1.0)
+    assert corrmat.register(GRID, GRID, model=network).rotation_deg == pytest.approx(0, abs=1e-4)
+    assert network.training
+    assert network.network.training
+    assert not network.frozen.training
+    with pytest.raises(CorrmatError, match="has its training diverged"):
+        corrmat.register(GRID, GRID, model=Fixed(np.nan))
+
+
+def test_only_the_shipped_weights_have_a_calibrated_confidence(pair):
+    _, source, target, _ = pair
+    texts = [
+        registration.to_text(corrmat.register(source, target, model=m)) for m in ("corrmat", "icp")
+    ]
+    assert ["fitted to the shipped weights" in text for text in texts] == [False, True]
 
 
 def test_points_that_are_near_on_one_side_are_coherent_and_scattered_ones_are_not():

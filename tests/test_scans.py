@@ -70,6 +70,11 @@ def test_a_table_may_begin_with_the_names_of_its_columns(tmp_path):
     assert read_scan(path).tolist() == [[1, 2, 3], [4, 5, 6]]
 
 
+def test_an_empty_cell_of_a_table_keeps_its_place(tmp_path):
+    (tmp_path / "table.csv").write_text("label,x,y,z,i\n,4,5,6,9\n,1,2,3,\n,0,0,1,\n")
+    assert read_scan(tmp_path / "table.csv").tolist() == [[4, 5, 6], [1, 2, 3], [0, 0, 1]]
+
+
 @pytest.mark.parametrize("header", ["id,x,y,z", "label x y z", '"n","X","Y","Z"', "//N X Y Z"])
 def test_the_names_of_columns_say_which_are_the_coordinates(tmp_path, header):
     separator = "," if "," in header else " "
@@ -101,7 +106,10 @@ def test_a_ply_keeps_millimetres_at_ten_thousand_kilometres(tmp_path):
         ("words.txt", b"one two three\n", "cannot be read as TXT"),
         ("german.txt", b"1,5 2,5 3,5\n2,0 1,0 0,5\n", "need a decimal point"),
         ("short.txt", b"1 2 3\n4 5\n", "row 2 holds 2 numbers"),
-        ("words.csv", b"x,y\nz,u\n", "row 1 holds 2 numbers"),
+        ("words.csv", b"x,y\nz,u\n", "the header names x, y, but not x, y and z"),
+        ("names.csv", b"id,px,py,pz\n7,1,2,3\n", "the header names id, px, py, pz"),
+        ("short.csv", b"x,y,z\n1,2\n", "row 1 holds 2 numbers"),
+        ("hole.csv", b"x,y,z,i\n4,,6,9\n", "a coordinate of row 1 is empty"),
         ("noise.npy", b"\x93NUMPY nonsense", "cannot be read as NPY"),
         ("noise.stl", b"solid nothing", "holds no points"),
         ("noise.pcd", b"VERSION .7\n", "cannot be read as PCD"),

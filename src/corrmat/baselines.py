@@ -6,7 +6,7 @@ in units in which a cloud's radius is about one.
 
 import contextlib
 import importlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -61,18 +61,10 @@ class Ransac(nn.Module):
     def forward(self, source: Tensor, target: Tensor) -> Prediction:
         """Register source (B, N, 6) to target (B, M, 6), xyz and unit normal; no correspondence."""
         clouds = zip(source.double().cpu().numpy(), target.double().cpu().numpy(), strict=True)
-        with _one_thread():
-            found = np.concatenate([fpfh_ransac(x, y, [self.SEED], refine=True) for x, y in clouds])
+        rows = [fpfh_ransac(x, y, [self.SEED], refine=True) for x, y in clouds]
         # Open3D's last bits depend on where its arrays lie in memory.
-        transform = torch.from_numpy(found.round(8)).to(source)
+        transform = torch.from_numpy(np.concatenate(rows).round(8)).to(source)
         return Prediction(transform[:, :3, :3], transform[:, :3, 3])
-
-
-def _one_thread() -> contextlib.AbstractContextManager[object]:
-    """Keep Open3D to one thread: on several, RANSAC is not the same twice."""
-    _open3d()  # threads of a library that is loaded later would not be limited
-    threadpoolctl: Any = importlib.import_module("threadpoolctl")
-    return threadpoolctl.threadpool_limits(1)
 
 
 class FpfhSettings(NamedTuple):
@@ -116,26 +108,22 @@ def fpfh_ransac(
     o3d, clouds, features = _fpfh(source, target, settings)
     registration = o3d.pipelines.registration
     point_to_point = registration.TransformationEstimationPointToPoint(False)
+    checks = [
+        registration.CorrespondenceCheckerBasedOnEdgeLength(0.9),
+        registration.CorrespondenceCheckerBasedOnDistance(settings.inlier_threshold),
+    ]
+    criteria = registration.RANSACConvergenceCriteria(settings.iterations, 0.999)
     transforms = []
     for seed in seeds:
-        o3d.utility.random.seed(seed)
-        result = registration.registration_ransac_based_on_feature_matching(
-            *clouds,
-            *features,
-            settings.mutual,
-            settings.inlier_threshold,
-            point_to_point,
-            3,
-            [
-                registration.CorrespondenceCheckerBasedOnEdgeLength(0.9),
-                registration.CorrespondenceCheckerBasedOnDistance(settings.inlier_threshold),
-            ],
-            registration.RANSACConvergenceCriteria(settings.iterations, 0.999),
-        )
-        if refine:
-            result = registration.registration_icp(
-                *clouds, settings.inlier_threshold, result.transformation, point_to_point
-            )
+        with _repeatable(o3d, seed):
+            result = registration.registration_ransac_based_on_feature_matching(
+                *clouds, *features, settings.mutual, settings.inlier_threshold, point_to_point, 3,
+                checks, criteria,
+            )  # fmt: skip
+            if refine:
+                result = registration.registration_icp(
+                    *clouds, settings.inlier_threshold, result.transformation, point_to_point
+                )
         transforms.append(np.array(result.transformation))
     return np.stack(transforms)
 
@@ -146,12 +134,21 @@ def fpfh_fgr(
     """Run Fast Global Registration (Zhou et al., ECCV 2016); see `fpfh_ransac`."""
     o3d, clouds, features = _fpfh(source, target, settings)
     registration = o3d.pipelines.registration
-    o3d.utility.random.seed(seed)
     option = registration.FastGlobalRegistrationOption(
         maximum_correspondence_distance=settings.inlier_threshold
     )
-    result = registration.registration_fgr_based_on_feature_matching(*clouds, *features, option)
+    with _repeatable(o3d, seed):
+        result = registration.registration_fgr_based_on_feature_matching(*clouds, *features, option)
     return np.array(result.transformation)
+
+
+@contextlib.contextmanager
+def _repeatable(o3d: Any, seed: int) -> Iterator[None]:  # noqa: ANN401
+    """Seed Open3D and keep it to one thread: on several, RANSAC is not the same twice."""
+    o3d.utility.random.seed(seed % 2**31)
+    threadpoolctl: Any = importlib.import_module("threadpoolctl")
+    with threadpoolctl.threadpool_limits(1):
+        yield
 
 
 class KissSettings(NamedTuple):
@@ -190,11 +187,14 @@ def kiss_matcher(
 
 
 def _open3d() -> Any:  # noqa: ANN401
-    """Import Open3D, which not everybody has."""
+    """Import Open3D, which not everybody has, and what keeps it to one thread."""
     try:
+        importlib.import_module("threadpoolctl")
         return importlib.import_module("open3d")
     except ImportError as error:
-        raise CorrmatError(f"ransac and fgr are Open3D's: pip install open3d ({error})") from error
+        raise CorrmatError(
+            f"ransac and fgr are Open3D's: pip install open3d threadpoolctl ({error})"
+        ) from error
 
 
 def _fpfh(

@@ -80,7 +80,7 @@ REGISTER_EPILOG = """examples:
   corrmat register front.ply left.ply back.ply -o moved/
       every scan onto the last: all pairs are registered, and the poses that most agree on win
   corrmat register a.npy b.npy --model ransac
-      the classical pipeline instead (pip install open3d)
+      the classical pipeline instead (pip install open3d threadpoolctl)
 
 Files: PLY, OBJ, STL, OFF, GLB, GLTF (meshes are sampled, scenes merged), PCD, XYZ, TXT, CSV,
 NPY, NPZ. Both files must have the same unit, whichever it is. Parts may be missing from either.

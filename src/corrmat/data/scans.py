@@ -177,20 +177,31 @@ def _text(path: Path, seed: int) -> np.ndarray:
     ]
     if lines and len(lines[-1].split()) > 1 and all(map(_DECIMAL_COMMA, lines[-1].split())):
         raise CorrmatError(f"{path}: numbers like 1,5 need a decimal point")
-    rows = [line.replace(",", " ").split() for line in lines]
+    rows = [_cells(line) for line in lines]
     if rows and len(rows[0]) == 1 and rows[0][0].isdigit():  # the number of points, in XYZ files
         rows = rows[1:]
     columns = [0, 1, 2]
     if len(rows) > 1 and not any(map(_is_number, rows[0])):  # a header
         names = [word.strip("\"'/").lower() for word in rows[0]]
-        if {"x", "y", "z"} <= set(names):
-            columns = [names.index(axis) for axis in "xyz"]
+        if not {"x", "y", "z"} <= set(names):
+            raise CorrmatError(
+                f"{path}: the header names {', '.join(names)}, but not x, y and z; rename them, or "
+                "delete the header if the first three columns are meant"
+            )
+        columns = [names.index(axis) for axis in "xyz"]
         rows = rows[1:]
-    short = next((i for i, row in enumerate(rows) if len(row) <= max(columns)), None)
-    if short is not None:
-        count = max(columns) + 1
-        raise CorrmatError(f"{path}: row {short + 1} holds {len(rows[short])} numbers, not {count}")
+    for number, row in enumerate(rows, 1):
+        if len(row) <= max(columns):
+            count = max(columns) + 1
+            raise CorrmatError(f"{path}: row {number} holds {len(row)} numbers, not {count}")
+        if not all(row[c] for c in columns):
+            raise CorrmatError(f"{path}: a coordinate of row {number} is empty")
     return np.array([[row[c] for c in columns] for row in rows], np.float64).reshape(-1, 3)
+
+
+def _cells(line: str) -> list[str]:
+    """Split a line at its commas, or else at its white space; an empty cell keeps its place."""
+    return [cell.strip() for cell in line.split(",")] if "," in line else line.split()
 
 
 def _is_number(word: str) -> bool:

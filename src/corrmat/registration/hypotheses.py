@@ -34,7 +34,7 @@ _NO_MATCHES = np.empty((0, 2), np.int64), np.empty(0)
 class Hypotheses(NamedTuple):
     """Rigid transforms that may take the source onto the target, and the matches behind them."""
 
-    transforms: np.ndarray  # (T, 4, 4) float64, T_target_source, best first
+    transforms: np.ndarray  # (T, 4, 4) float64, T_target_source
     matches: np.ndarray  # (K, 2) int64 rows of source and target; K may be 0
     confidence: np.ndarray  # (K,) in [0, 1]
 
@@ -87,7 +87,7 @@ class NetworkHypotheses:
         count: int = 16,
         count_by_agreement: int = 8,
     ) -> None:
-        self.network = network.eval()
+        self.network = network
         self.inlier_threshold, self.num_matches = inlier_threshold, num_matches
         self.count, self.count_by_agreement = count, count_by_agreement
 
@@ -95,14 +95,9 @@ class NetworkHypotheses:
     def __call__(self, source: np.ndarray, target: np.ndarray, seed: int) -> Hypotheses:
         """Generate hypotheses for source (N, 6) and target (M, 6)."""
         x, y = (torch.from_numpy(np.asarray(c, np.float32)).unsqueeze(0) for c in (source, target))
-        least = int(getattr(self.network, "min_points", 3))
-        if min(x.shape[1], y.shape[1]) < least:
-            raise CorrmatError(f"this network needs clouds of at least {least} points")
-        prediction = self.network(x, y)
-        own_transform = _matrix(prediction.rotation[0], prediction.translation[0])[None]
-        if prediction.correspondence is None:
+        own_transform, prob = self._predict(x, y)
+        if prob is None:
             return Hypotheses(own_transform, *_NO_MATCHES)
-        prob = prediction.correspondence.prob()[0, :, : y.shape[1]]
         # The strongest entries that are the maximum of their row or of their column.
         is_max = (prob == prob.amax(0)) | (prob == prob.amax(1, keepdim=True))
         weight, place = (prob * is_max).flatten().topk(min(self.num_matches, prob.numel()))
@@ -118,6 +113,34 @@ class NetworkHypotheses:
         transforms += [_matrix(rotation[k], translation[k]) for k in best]
         matches = torch.stack([i, j], 1).numpy()
         return Hypotheses(np.stack([*transforms, *own_transform]), matches, weight.double().numpy())
+
+    def _predict(self, x: torch.Tensor, y: torch.Tensor) -> tuple[np.ndarray, torch.Tensor | None]:
+        """Run the network, wherever it lies, and leave it in the mode that it was in.
+
+        Args:
+            x: (1, N, 6).
+            y: (1, M, 6).
+
+        Returns:
+            Its own transform (1, 4, 4), and the probabilities of matches (N, M); None without any.
+        """
+        least = int(getattr(self.network, "min_points", 3))
+        if min(x.shape[1], y.shape[1]) < least:
+            raise CorrmatError(f"this network needs clouds of at least {least} points")
+        device = next((p.device for p in self.network.parameters()), x.device)
+        modes = [(module, module.training) for module in self.network.modules()]
+        self.network.eval()
+        try:
+            prediction = self.network(x.to(device), y.to(device))
+        finally:
+            for module, mode in modes:
+                module.training = mode
+        transform = _matrix(prediction.rotation[0].cpu(), prediction.translation[0].cpu())[None]
+        if not np.isfinite(transform).all():
+            raise CorrmatError("the network's transform is not finite: has its training diverged?")
+        if prediction.correspondence is None:
+            return transform, None
+        return transform, prediction.correspondence.prob()[0, :, : y.shape[1]].cpu()
 
 
 def rough_agreement(

@@ -94,7 +94,10 @@ def register(
     if not 0 <= seed < 2**63:
         raise CorrmatError(f"seed = {seed} is not between 0 and 2^63")
     if isinstance(model, nn.Module):
-        generate: HypothesisGenerator = NetworkHypotheses(getattr(model, "network", model))
+        network = getattr(model, "network", None)  # of a method
+        generate: HypothesisGenerator = NetworkHypotheses(
+            network if isinstance(network, nn.Module) and hasattr(network, "min_points") else model
+        )
         model = type(model).__name__
     else:
         generate = CLASSICAL.get(str(model)) or _load_network(str(model))
@@ -198,6 +201,8 @@ class Cloud:
         few = np.argpartition(rank, size)[:size] if len(rank) > size else np.arange(size)
         rows = few[np.argsort(rank[few])]
         rows = rows[_is_near(values[rows, :3], name)]
+        if len(rows) < 3:
+            raise CorrmatError(f"{name}: {len(rows)} points are left without the stray ones")
         checked = cls(rows, values[rows])
         length, breadth, _ = np.linalg.svd(checked.centred, compute_uv=False)[:3]
         noise = 1e-12 * np.abs(checked.values[:, :3]).max() * np.sqrt(len(rows))
@@ -280,10 +285,10 @@ def to_text(registration: Registration) -> str:
     if len(registration.matches):
         agree, matches = registration.match_agrees.sum(), len(registration.matches)
         lines.append(f"matches      {agree} of {matches} agree with the transform")
-    fitted = registration.model in ("corrmat", *CLASSICAL)
-    doubt = "" if fitted else "  (fitted to the shipped weights, not to this model)"
+    fitted = registration.model == "corrmat"
+    note = "" if fitted else "  (fitted to the shipped weights, not to this model)"
     lines += [
-        f"confidence   {registration.confidence:.0%}{doubt}",
+        f"confidence   {registration.confidence:.0%}{note}",
         f"verdict      {registration.verdict}",
     ]
     return "\n".join(
