@@ -29,7 +29,7 @@ from corrmat.registration.register import (
     to_original_units,
 )
 from corrmat.registration.scoring import AlignmentScorer
-from corrmat.reporting.provenance import commit
+from corrmat.revision import commit
 from corrmat.types import PairBatch
 from corrmat.weights import load_model
 

@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from jsonargparse import ArgumentParser
 
-from corrmat.training import console
+from corrmat.training import console, recipe
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = Path(os.environ.get("CORRMAT_SHARED", ROOT.parent / "shared"))
@@ -51,6 +52,13 @@ def _quiet_and_offline(monkeypatch, tmp_path):
 @pytest.fixture
 def generator():
     return torch.Generator().manual_seed(0)
+
+
+def parse_overrides(words: list[str]) -> dict:
+    """Settings like ["--data.keep", "0.7"] as nested overrides for `recipe.load`."""
+    parser = ArgumentParser(exit_on_error=False)
+    recipe.add_settings(parser)
+    return parser.parse_args(words, defaults=False).as_dict()
 
 
 def random_rotation(batch: int, generator: torch.Generator) -> torch.Tensor:

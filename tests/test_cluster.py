@@ -8,11 +8,11 @@ import threading
 from pathlib import Path
 
 import pytest
-from conftest import ROOT
+from conftest import ROOT, parse_overrides
 from test_experiment import load, numbers
 
 from corrmat.errors import CorrmatError
-from corrmat.training import cluster, experiment, recipe
+from corrmat.training import cluster, experiment
 
 CONFIGS = [ROOT / "configs/exp" / f"{name}.yaml" for name in ("1.1", "1.4")]
 
@@ -41,7 +41,7 @@ def test_arms_trained_by_two_workers_one_of_them_killed_give_the_same_record(tmp
     killer = threading.Thread(target=kill_a_worker_after, args=(checkpoint, killed), daemon=True)
     killer.start()
     try:
-        overrides = recipe.parse_overrides(["--trainer.enable_progress_bar", "false", *steps])
+        overrides = parse_overrides(["--trainer.enable_progress_bar", "false", *steps])
         cluster.train_all(CONFIGS, "smoke", overrides, tmp_path / "runs", "none")
     finally:
         ray.shutdown()

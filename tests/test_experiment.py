@@ -16,7 +16,7 @@ import sys
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT, shared
+from conftest import ROOT, parse_overrides, shared
 from rich.console import Console
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
@@ -38,7 +38,7 @@ IDS = [path.stem for path in sorted((ROOT / "configs" / "exp").glob("*.yaml"))]
 def load(identity, *options, arms=None):
     path = ROOT / "configs" / "exp" / f"{identity}.yaml"
     words = ["--trainer.enable_progress_bar", "false", *options]
-    return recipe.load(path, "smoke", recipe.parse_overrides(words), arms)
+    return recipe.load(path, "smoke", parse_overrides(words), arms)
 
 
 def train(settings, folder, **options):
@@ -284,7 +284,7 @@ def test_a_signal_while_a_line_is_printed_still_stops_with_a_checkpoint(tmp_path
 def test_a_network_that_the_paper_knows_nothing_of_leaves_a_record(tmp_path):
     """Without a matrix to be looked at, and without a figure of the paper's to follow."""
     options = ["--trainer.enable_progress_bar", "false", "--data.data", "shapes"]
-    overrides = recipe.parse_overrides(options)
+    overrides = parse_overrides(options)
     loaded = recipe.load(ROOT / "configs" / "weights.yaml", "smoke", overrides)
     experiment.run(loaded, tmp_path / "results", tmp_path / "runs")
     folder = tmp_path / "results" / "smoke" / "shapes" / loaded.id
@@ -325,9 +325,13 @@ def test_an_arm_that_was_finished_is_not_trained_again_before_its_record(tmp_pat
     record = experiment.run(loaded, tmp_path / "results", tmp_path / "runs")
     shown = capsys.readouterr().out
     assert shown.count("trained already") == shown.count("continuing from") == 1
+    folder = tmp_path / "runs" / loaded.place / "DCP"
+    old = (folder / "best.ckpt").read_bytes()
     again = experiment.run(loaded, tmp_path / "results", tmp_path / "runs")
     assert "trained already" not in capsys.readouterr().out
     assert numbers(again) == numbers(record)
+    kept = folder.with_name("DCP.previous") / "best.ckpt"
+    assert kept.read_bytes() == old  # what a record was tested with is not lost
 
 
 def test_the_last_step_is_validated_wherever_it_falls(tmp_path):

@@ -82,7 +82,10 @@ def test_matches_count_only_rows_that_have_one():
     match = torch.tensor([[0, 1, 2, -1, 5]])
     predicted = torch.tensor([[0, 1, 0, 3, 5]])
     assert metrics.num_correct(predicted, match, num_target=5).tolist() == [2]
-    assert metrics.match_accuracy(predicted, match, 5).tolist() == [pytest.approx(2 / 3)]
+    assert metrics.match_accuracy(predicted, match, 5).item() == pytest.approx(2 / 3)
+    pairs = torch.cat([predicted] * 2), torch.cat([match, torch.full_like(match, -1)])
+    assert metrics.match_accuracy(*pairs, 5).item() == pytest.approx(2 / 3)  # not NaN
+    assert metrics.match_accuracy(predicted, torch.full_like(match, -1), 5).item() == 0
 
 
 def test_chamfer_equals_its_twin(batch, generator):

@@ -9,7 +9,7 @@ from conftest import ROOT
 from corrmat.errors import CorrmatError
 from corrmat.training import rates, recipe
 
-SWEPT = sorted((ROOT / "results" / "rates").glob("*.json"))
+SWEPT = sorted((ROOT / "results" / "rates").glob("*/*/*.json"))
 
 
 def load(identity, scale):
@@ -18,7 +18,7 @@ def load(identity, scale):
 
 def test_every_arm_is_trained_at_the_same_three_factors_and_the_best_is_chosen(tmp_path):
     swept = rates.sweep(load("1.2", "smoke"), tmp_path / "results", tmp_path / "runs")
-    record = json.loads((tmp_path / "results" / "rates" / "1.2.json").read_text())
+    record = json.loads((tmp_path / "results/rates/smoke/shapes/1.2.json").read_text())
     assert list(record["arms"]) == ["DCP", "DCP_corr"]
     for arm, results in swept.items():
         assert [rate.lr for rate in results] == [0.00067, 0.002, 0.006]

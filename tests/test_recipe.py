@@ -1,7 +1,7 @@
 import pytest
 import torch
 import yaml
-from conftest import ROOT, shared
+from conftest import ROOT, parse_overrides, shared
 
 from corrmat.data.datamodule import RegistrationDataModule, data_name
 from corrmat.data.pairs import PairSettings
@@ -22,7 +22,7 @@ def datamodule_of(settings):
 
 def load(identity, scale, *options):
     path = ROOT / "configs" / "exp" / f"{identity}.yaml"
-    return recipe.load(path, scale, recipe.parse_overrides(options))
+    return recipe.load(path, scale, parse_overrides(options))
 
 
 @pytest.mark.parametrize("scale", recipe.SCALES)
@@ -173,7 +173,7 @@ def test_layers_lie_over_each_other(tmp_path):
     )
     path = tmp_path / "x.yaml"
     path.write_text("id: x\ntitle: t\nbase: base.yaml\ndata: {keep: 0.8}\n")
-    overrides = recipe.parse_overrides(["--network.width", "64", "--data.jitter=0.5"])
+    overrides = parse_overrides(["--network.width", "64", "--data.jitter=0.5"])
     experiment = recipe.load(path, "smoke", overrides)
     dcp, corr = experiment.arms["DCP"], experiment.arms["DCP_corr"]
     assert (dcp.data.num_points, dcp.data.keep, dcp.data.jitter) == (100, 0.8, 0.5)

@@ -214,6 +214,8 @@ def test_the_overview_has_a_panel_for_the_longest_training_of_each_experiment(
     monkeypatch.setattr(overview, "_draw_panel", lambda axes, record: drawn.append(record.id))
     assert overview.draw_overview(chosen).startswith(b"\x89PNG")
     assert drawn == [record.id for record in chosen]
+    with pytest.raises(CorrmatError, match="no record to draw"):
+        overview.draw_overview([])
     assert overview._curve_points(records[0].arms["DCP"])[0][-1] >= 8000
 
 

@@ -1,11 +1,18 @@
 """The one error type that users see, and the checks that settings and networks share."""
 
 import dataclasses
+import textwrap
 import typing
 
 
 class CorrmatError(Exception):
     """User input cannot be used. The message names the input and says what to do."""
+
+
+def short_message(error: Exception) -> str:
+    """Return the first two lines of an error of a library as one line."""
+    lines = [line.strip(" -") for line in str(error).splitlines() if line.strip(" -")]
+    return textwrap.shorten(" ".join(lines[:2]), 400, placeholder=" ...") or type(error).__name__
 
 
 def require_positive(**sizes: int) -> None:

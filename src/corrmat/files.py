@@ -28,9 +28,8 @@ def replace_bytes(path: Path, content: bytes | memoryview) -> None:
     try:
         partial.write_bytes(content)
         partial.replace(path)
-    except OSError:
+    finally:
         partial.unlink(missing_ok=True)
-        raise
 
 
 def ensure_writable(folder: Path) -> None:

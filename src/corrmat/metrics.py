@@ -90,9 +90,9 @@ def num_correct(predicted: Tensor, match: Tensor, num_target: int) -> Tensor:
 
 
 def match_accuracy(predicted: Tensor, match: Tensor, num_target: int) -> Tensor:
-    """Compute the share (B,) float64 of rows with a match whose arg max is that match."""
-    num_matchable = is_match(match, num_target).sum(1)
-    return num_correct(predicted, match, num_target).double() / num_matchable
+    """Compute the share () of a batch's points with a match whose arg max is it; 0 without any."""
+    num_matchable = is_match(match, num_target).sum()
+    return num_correct(predicted, match, num_target).sum() / num_matchable.clamp_min(1)
 
 
 def num_correct_transposed(predicted: Tensor, match: Tensor) -> Tensor:

@@ -91,7 +91,7 @@ class RegistrationModule(L.LightningModule):
         if is_logged and prediction.correspondence is not None:
             predicted = prediction.correspondence.argmax()
             accuracy = match_accuracy(predicted, batch.match, batch.target.shape[1])
-            self.log("train/matches", accuracy.mean().float(), prog_bar=True, batch_size=len(batch))
+            self.log("train/matches", accuracy, prog_bar=True, batch_size=len(batch))
         return loss
 
     def _is_logged_step(self) -> bool:

@@ -7,7 +7,7 @@ from typing import Literal
 
 from jsonargparse import ArgumentParser, Namespace
 
-from corrmat.errors import CorrmatError
+from corrmat.errors import CorrmatError, short_message
 
 SHORT_HELP = """corrmat: Correspondence Matrices are Underrated (3DV 2020), reproduced.
 
@@ -109,8 +109,7 @@ def parse(words: Sequence[str]) -> Namespace:
         parsed = parser.parse_args(list(words))
         given = parser.parse_args(list(words), defaults=False) if command else Namespace()
     except argparse.ArgumentError as error:
-        lines = [line.strip(" -") for line in str(error).splitlines() if line.strip(" -")]
-        raise CorrmatError(f"{' '.join(lines[:2])}; see corrmat --help") from error
+        raise CorrmatError(f"{short_message(error)}; see corrmat --help") from error
     options = parsed[parsed.command]
     options.command = parsed.command
     if command:

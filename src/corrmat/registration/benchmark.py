@@ -19,7 +19,7 @@ from corrmat.errors import CorrmatError
 from corrmat.files import replace_text
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG, rotation_error_deg
 from corrmat.registration.register import Refine, register
-from corrmat.reporting.provenance import commit
+from corrmat.revision import commit
 from corrmat.types import PairBatch
 
 Protocol = Literal["paper", "real", "views", "clean", "rooms"]

@@ -17,7 +17,7 @@ from corrmat.registration.register import Cloud, Refine, matrix_lines, register
 
 _SWEEPS = 50  # of averaging; poses settle within ten
 # How far a registration may be off the poses to agree with them: in degrees, and as a share of the
-# median distance of a scan's points from their middle.
+# median distance of a scan's points from their centroid.
 _ANGLE_DEG, _SHARE = 10.0, 0.2
 
 
@@ -58,14 +58,15 @@ def register_scans(
     """
     if len(scans) < 2:
         raise CorrmatError(f"{len(scans)} scan: two or more are needed")
-    for number, scan in enumerate(scans, 1):  # so that errors name the right one
-        Cloud.of(scan, f"scan {number} of {len(scans)}", seed)
+    clouds = [
+        Cloud.of(scan, f"scan {number} of {len(scans)}", seed)  # so that errors name the right one
+        for number, scan in enumerate(scans, 1)
+    ]
     edges = []
     pairs = list(itertools.combinations(range(len(scans)), 2))
     for i, j in track(pairs, "registering pairs", transient=True, disable=len(pairs) == 1):
         registration = register(scans[i], scans[j], model=model, refine=refine, seed=seed)
         edges.append(_Edge(i, j, registration.transform, registration.confidence))
-    clouds = [np.asarray(scan, np.float64)[:, :3] for scan in scans]  # register has checked them
     graph = _PoseGraph(clouds, edges)
     return [graph.pose(index) for index in range(len(scans) - 1)]
 
@@ -108,15 +109,14 @@ class _PoseGraph:
     """Poses of scans, kept as rotation and image of the centroid: exact far from the origin.
 
     Args:
-        clouds: (N, 3) each; the last one's pose is the identity.
+        clouds: the last one's pose is the identity.
         edges: registrations of pairs.
     """
 
-    def __init__(self, clouds: Sequence[np.ndarray], edges: Sequence[_Edge]) -> None:
+    def __init__(self, clouds: Sequence[Cloud], edges: Sequence[_Edge]) -> None:
         self.edges, self.last = edges, len(clouds) - 1
-        self.centres = np.stack([cloud.mean(0) for cloud in clouds])
-        sizes = [np.median(np.linalg.norm(c - np.median(c, axis=0), axis=1)) for c in clouds]
-        self.tolerance = _SHARE * float(np.mean(sizes))
+        self.centres = np.stack([cloud.centre for cloud in clouds])
+        self.tolerance = _SHARE * float(np.mean([cloud.median for cloud in clouds]))
         self.rotations = np.stack([np.eye(3)] * len(clouds))
         self.images = self.centres.copy()  # of the centroids, in the last scan's frame
         self.confidence = np.ones(len(clouds))
@@ -147,9 +147,9 @@ class _PoseGraph:
 
     def _agrees(self, index: int, rotation: np.ndarray, image: np.ndarray) -> bool:
         """Tell whether a prediction is near a scan's pose."""
-        turn = Rotation.from_matrix(rotation @ self.rotations[index].T).magnitude()
-        off = np.linalg.norm(image - self.images[index])
-        return bool(np.degrees(turn) < _ANGLE_DEG and off < self.tolerance)
+        angle = Rotation.from_matrix(rotation @ self.rotations[index].T).magnitude()
+        distance = np.linalg.norm(image - self.images[index])
+        return bool(np.degrees(angle) < _ANGLE_DEG and distance < self.tolerance)
 
     def _span(self) -> None:
         """Place the scans one by one, always over the surest registration to a placed one."""

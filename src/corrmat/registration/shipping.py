@@ -12,7 +12,7 @@ from corrmat import weights
 from corrmat.files import replace_text
 from corrmat.metrics import ADDS_THRESHOLD
 from corrmat.registration import benchmark
-from corrmat.reporting.provenance import commit
+from corrmat.revision import commit
 
 CALIBRATION_PAIRS = 300
 _PROTOCOLS: tuple[benchmark.Protocol, ...] = ("real", "views", "clean")

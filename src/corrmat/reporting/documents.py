@@ -80,9 +80,9 @@ def headline_table(results: Results) -> str:
 
 def rates_table(results: Path) -> str:
     """Build the table of the learning-rate sweeps: validation error by rate, the choice in bold."""
-    heads = ["experiment", "arm", "pairs", "a third", "the recipe's rate before", "three times"]
+    heads = ["experiment", "arm", "pairs", "a third of it", "starting rate", "three times it"]
     lines = [markdown_row(heads), "|" + "---|" * len(heads)]
-    for path in sorted(results.glob("rates/*.json")):
+    for path in sorted(results.glob("rates/*/*/*.json")):
         sweep = json.loads(path.read_text())
         for arm, result in sweep["arms"].items():
             cells = []
@@ -90,7 +90,8 @@ def rates_table(results: Path) -> str:
                 cell = f"{rate['lr']:g}: {rate['rotation_error_deg_mean']:.3g} deg"
                 cells.append(f"**{cell}**" if rate["lr"] == result["chosen"] else cell)
             pairs = f"{result['rates'][0]['pairs_seen']:,}"
-            lines.append(markdown_row([sweep["id"], arm, pairs, *cells]))
+            where = f"{sweep['id']}, {sweep['scale']}, {sweep['data']}"
+            lines.append(markdown_row([where, arm, pairs, *cells]))
     return "\n".join(lines)
 
 

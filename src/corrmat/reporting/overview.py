@@ -6,6 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, NullFormatter
 
+from corrmat.errors import CorrmatError
 from corrmat.reporting.figures import GREY, arm_colours, to_png
 from corrmat.reporting.record import ArmResult, Record, defined
 
@@ -37,7 +38,12 @@ def draw_overview(records: Sequence[Record]) -> bytes:
 
     Args:
         records: one of each experiment.
+
+    Raises:
+        CorrmatError: there are none.
     """
+    if not records:
+        raise CorrmatError("no record to draw: make exp1.2 writes one (smoke runs are not drawn)")
     rows = -(-len(records) // COLUMNS)
     figure = Figure(figsize=(8.2, 1.95 * rows + 0.5), layout="constrained")
     panels = figure.subplots(rows, COLUMNS, squeeze=False).flat

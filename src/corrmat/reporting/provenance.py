@@ -1,8 +1,7 @@
-"""Where a record comes from: the commit of the code, and what has changed since."""
+"""Where a record comes from: its command, and what of the code has changed since its commit."""
 
 import ast
 import functools
-import subprocess
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -10,25 +9,13 @@ import yaml
 
 from corrmat.methods import METHODS
 from corrmat.reporting.record import Record
+from corrmat.revision import PACKAGE, git
 
-PACKAGE = Path(__file__).resolve().parents[1]
 # The modules that compute an arm's numbers; what they import belongs to it, up to the boundary.
 _ROOTS = ("corrmat.training.fit", "corrmat.training.recipe")
 _BOUNDARY = ("corrmat.reporting", "corrmat.training.console", "corrmat.training.loggers")
 _NETWORKS = "corrmat.networks"
 _NOT_TRAINING = ("title", "paper", "baselines", "test_pairs", "scales")  # keys of a recipe
-
-
-def commit() -> str | None:
-    """Return the commit of the code, with "+" if files have changed; None outside a checkout."""
-    try:
-        changed = _git(PACKAGE, "status", "--porcelain", "--", ".", "../../configs")
-        head = _git(PACKAGE, "rev-parse", "--short=12", "HEAD")
-    except OSError:
-        return None
-    if head.returncode or changed.returncode or not _is_ours():
-        return None
-    return head.stdout.strip() + ("+" if changed.stdout.strip() else "")
 
 
 def command(record: Record) -> str:
@@ -59,13 +46,13 @@ def staleness(record: Record, repository: Path) -> str:
     changed: set[str] = set()
     for name in commits:
         try:
-            diff = _git(repository, "diff", "--name-only", "--relative", name, "--", *code)
+            diff = git(repository, "diff", "--name-only", "--relative", name, "--", *code)
         except OSError:
             return "git is not at hand, so nobody can tell whether the code has changed"
         if diff.returncode:
             return f"commit {name} is not at hand, so nobody can tell whether the code has changed"
         for path in diff.stdout.split():
-            then, now = _git(repository, "show", f"{name}:./{path}"), repository / path
+            then, now = git(repository, "show", f"{name}:./{path}"), repository / path
             if then.returncode or not now.exists():
                 changed.add(now.name)
                 continue
@@ -140,12 +127,3 @@ def _meaning(name: str, text: str, scale: str) -> object:
         if documented and ast.get_docstring(node, clean=False) is not None:
             del node.body[0]
     return ast.dump(tree)
-
-
-def _is_ours() -> bool:
-    """Tell whether git tracks this package (and not a folder that it is installed into)."""
-    return not _git(PACKAGE, "ls-files", "--error-unmatch", "__init__.py").returncode
-
-
-def _git(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(["git", *words], cwd=folder, capture_output=True, text=True)

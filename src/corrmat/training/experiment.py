@@ -16,11 +16,11 @@ from corrmat.losses import CorrespondenceLoss
 from corrmat.metrics import summary
 from corrmat.module import OptimizerSettings, RegistrationModule
 from corrmat.reporting.claims import verdicts
-from corrmat.reporting.provenance import commit
 from corrmat.reporting.record import ArmResult, Record, Subset
 from corrmat.reporting.snapshots import PairSnapshot, take_snapshot
 from corrmat.reporting.tables import terminal_table
 from corrmat.reporting.writer import pair_rows, write_record
+from corrmat.revision import commit
 from corrmat.training import loggers, runs
 from corrmat.training.console import Board
 from corrmat.training.fit import fresh_method, load_trained, score, seconds_to_train, train
@@ -56,6 +56,7 @@ def run(
     """
     for folder in (results, runs_folder):
         ensure_writable(folder / recipe.place)
+    run_at = commit()
     arms = [prepare(settings) for settings in recipe.arms.values()]
     digest = _check_test_pairs(recipe, arms)
     trained: dict[str, TrainedArm] = {}
@@ -98,7 +99,7 @@ def run(
         treatment=recipe.treatment,
         controls=list(recipe.controls),
         seed=arms[0].settings.seed,
-        commit=commit(),
+        commit=run_at,
         hardware=_merge_hardware([arm.hardware for arm in trained.values()]),
         versions={name: version(name) for name in ("corrmat", "torch", "lightning", "numpy")},
         test_pairs=digest,

@@ -13,10 +13,10 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from torch import Tensor
 
 from corrmat.data.datamodule import PairDataset
-from corrmat.errors import CorrmatError
+from corrmat.errors import CorrmatError, short_message
 from corrmat.methods import Method
 from corrmat.module import RegistrationModule
-from corrmat.reporting.provenance import commit
+from corrmat.revision import commit
 from corrmat.training import loggers, runs
 from corrmat.training.callbacks import PerPairCollector, SaveOnInterrupt, ValidationHistory
 from corrmat.training.console import Board, BoardProgress
@@ -62,6 +62,7 @@ def train(
         CorrmatError: a loss that is not finite; a full disk.
         KeyboardInterrupt: Ctrl-C in the last step; the arm is trained.
     """
+    trained_at = commit()
     method = fresh_method(arm.settings)
     resume_from = None if fresh else runs.find_interrupted(folder, arm)
     if resume_from is None:
@@ -108,7 +109,7 @@ def train(
         log.info("training ended before the first validation: the last weights count as the best")
         trainer.save_checkpoint(best)
     trained = TrainedArm(
-        best, history.pairs_seen, history.seconds, commit(), history.points,
+        best, history.pairs_seen, history.seconds, trained_at, history.points,
         describe_hardware(arm.settings),
     )  # fmt: skip
     if is_first_process():
@@ -172,7 +173,7 @@ def load_trained(arm: Arm, checkpoint: Path) -> Method:
         state = torch.load(checkpoint, map_location="cpu", weights_only=True)["state_dict"]
         method.load_state_dict(state)
     except Exception as error:  # unpickling raises errors of every type
-        reason = str(error).splitlines()[0]
+        reason = short_message(error)
         raise CorrmatError(f"{checkpoint} does not fit these settings: {reason}") from error
     return method
 

@@ -49,7 +49,7 @@ def sweep(
 
     Args:
         recipe: the experiment at the scale whose budget counts.
-        results: folder of records; this one goes to rates/<id>.json.
+        results: folder of records; this one goes to rates/<scale>/<data>/<id>.json.
         runs_folder: folder of checkpoints and logs, resumed where one was interrupted.
         logger: see `loggers.make_loggers`.
         fresh: train anew what was trained before.
@@ -60,7 +60,8 @@ def sweep(
     Raises:
         CorrmatError: no arm has a rate to choose, or a budget in steps to take a twentieth of.
     """
-    ensure_writable(results / FOLDER)
+    path = results / FOLDER / recipe.place.parent / f"{recipe.place.name}.json"
+    ensure_writable(path.parent)
     arms = {n: s for n, s in recipe.arms.items() if s.optimizer.schedule == "onecycle"}
     if not arms:
         raise CorrmatError(f"{recipe.id} at {recipe.scale} scale has no arm with a rate to choose")
@@ -92,8 +93,8 @@ def sweep(
             for name, rates in swept.items()
         },
     }
-    (results / FOLDER).mkdir(parents=True, exist_ok=True)
-    replace_text(results / FOLDER / f"{recipe.id}.json", json.dumps(content, indent=1) + "\n")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    replace_text(path, json.dumps(content, indent=1) + "\n")
     return swept
 
 

@@ -18,7 +18,7 @@ from jsonargparse import ArgumentParser, Namespace
 
 from corrmat.baselines import BASELINES, UNTRAINED
 from corrmat.data.datamodule import RegistrationDataModule, data_name
-from corrmat.errors import CorrmatError
+from corrmat.errors import CorrmatError, short_message
 from corrmat.methods import METHODS
 from corrmat.module import OptimizerSettings
 from corrmat.reporting.record import ArmResult, place_of
@@ -173,20 +173,6 @@ def add_settings(parser: ArgumentParser, methods: Sequence[str] | None = None) -
     )  # fmt: skip
 
 
-def parse_overrides(options: Sequence[str]) -> Settings:
-    """Parse options like ["--data.keep", "0.7"] to nested overrides for `load`.
-
-    Raises:
-        CorrmatError: an option is unknown, or a value has another type.
-    """
-    parser = ArgumentParser(prog="corrmat", exit_on_error=False)
-    add_settings(parser)
-    try:
-        return parser.parse_args(list(options), defaults=False).as_dict()
-    except Exception as error:  # jsonargparse raises errors of several types
-        raise CorrmatError(first_line(error)) from error
-
-
 def merge(under: Mapping[str, object], over: Mapping[str, object]) -> Settings:
     """Merge dictionaries key by key; other values are replaced."""
     merged = dict(under)
@@ -197,12 +183,6 @@ def merge(under: Mapping[str, object], over: Mapping[str, object]) -> Settings:
         else:
             merged[key] = value
     return merged
-
-
-def first_line(error: Exception) -> str:
-    """Return the first two lines of an error of jsonargparse as one line."""
-    lines = [line.strip(" -") for line in str(error).splitlines() if line.strip(" -")]
-    return " ".join(lines[:2])
 
 
 def _add_union(parser: ArgumentParser, group: str, classes: Sequence[type]) -> None:
@@ -309,11 +289,13 @@ def _arm_settings(
     try:
         parser.parse_object(settings)
     except Exception as error:  # jsonargparse raises errors of several types
-        raise CorrmatError(f"{path}: {first_line(error)}") from error
+        raise CorrmatError(f"{path}: {short_message(error)}") from error
     try:
         parsed = parser.parse_object(merge(settings, overrides))
     except Exception as error:
-        raise CorrmatError(f"{first_line(error)} (corrmat fit --help lists the options)") from error
+        raise CorrmatError(
+            f"{short_message(error)} (corrmat fit --help lists the options)"
+        ) from error
     return ArmSettings(
         arm, method, parsed.seed, parsed.data, parsed.network,
         parsed.get("loss") or Namespace(), OptimizerSettings(**parsed.optimizer.as_dict()),
@@ -369,7 +351,7 @@ def _read(path: Path) -> Settings:
     try:
         content = yaml.safe_load(path.read_text())
     except yaml.YAMLError as error:
-        raise CorrmatError(f"{path} is not YAML: {first_line(error)}") from error
+        raise CorrmatError(f"{path} is not YAML: {short_message(error)}") from error
     if not isinstance(content, dict):
         raise CorrmatError(f"{path} holds no settings")
     return content

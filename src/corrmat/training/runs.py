@@ -53,14 +53,15 @@ def training_settings(arm: Arm) -> str:
 
 
 def set_aside(folder: Path, arm: Arm) -> None:
-    """Make room for a run: delete one of the same settings, keep the last one of others."""
-    if not (folder / _SETTINGS).is_file() or _same_settings(folder, arm):
+    """Make room for a run: keep one that a record was written of, or of other settings."""
+    recorded = (folder / _RECORDED).exists()
+    if not (folder / _SETTINGS).is_file() or (_same_settings(folder, arm) and not recorded):
         shutil.rmtree(folder, ignore_errors=True)
         return
     kept = folder.with_name(f"{folder.name}.previous")
     shutil.rmtree(kept, ignore_errors=True)
     folder.rename(kept)
-    log.info(f"the run of other settings is kept: {kept}")
+    log.info(f"the earlier run is kept: {kept}")
 
 
 def start_run(folder: Path, arm: Arm) -> None:

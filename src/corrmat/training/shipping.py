@@ -14,7 +14,7 @@ MAX_PARAMETERS = 2_000_000  # PCRNet's pose network, of 17 MB, is left out
 def ship_arms(recipe: Recipe, results: Path, runs_folder: Path) -> list[str]:
     """Write the weights of METHOD and METHOD_corr that a record was tested with into the package.
 
-    Weights of a larger scale that ship already are kept.
+    Only seed 0 on the embedded shapes ships; weights of a larger scale that ship already are kept.
 
     Args:
         recipe: the experiment.
@@ -31,6 +31,8 @@ def ship_arms(recipe: Recipe, results: Path, runs_folder: Path) -> list[str]:
     shipped = []
     for name in filter(None, (recipe.baseline, recipe.treatment)):
         settings = recipe.arms[name]
+        if recipe.data != "shapes" or settings.seed:
+            continue
         model = f"{recipe.id}/{name}"
         if model in weights.shipped_models() and _shipped_scale(model) > SCALES.index(recipe.scale):
             continue
