@@ -20,15 +20,7 @@ from corrmat.data.pairs import STREAM, Key, make_pairs
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG
 from corrmat.registration import benchmark
 from corrmat.registration.hypotheses import NetworkHypotheses
-from corrmat.registration.register import (
-    MEDIAN,
-    MODEL_POINTS,
-    SELECTION_POINTS,
-    Cloud,
-    measure_candidates,
-    to_original_units,
-)
-from corrmat.registration.scoring import AlignmentScorer
+from corrmat.registration.register import measure_candidates, prepare_clouds, to_original_units
 from corrmat.revision import commit
 from corrmat.types import PairBatch
 from corrmat.weights import load_model
@@ -60,10 +52,7 @@ def held_out_pairs(protocol: benchmark.Protocol, count: int) -> PairBatch:
 def candidates(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> np.ndarray:
     """Compute agreement, coherence, support, degrees and ADD-S of a pair's candidates (T, 5)."""
     source, target = (c[index].double().numpy() for c in (pairs.source, pairs.target))
-    x, y = Cloud.of(source, "source", 0), Cloud.of(target, "target", 0)
-    scale = 2 * MEDIAN / (x.median + y.median)
-    scorer = AlignmentScorer(x.points(scale, SELECTION_POINTS), y.points(scale, SELECTION_POINTS))
-    subsamples = x.with_normals(scale, MODEL_POINTS), y.with_normals(scale, MODEL_POINTS)
+    (x, y), scale, subsamples, scorer = prepare_clouds(source, target, 0)
     transforms, measures = measure_candidates(generate(*subsamples, 0), subsamples, scorer)
     in_units = [to_original_units(t, scale, x.centre, y.centre) for t in transforms]
     return np.hstack([measures, [benchmark.errors(pairs, index, t) for t in in_units]])

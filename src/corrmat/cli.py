@@ -226,7 +226,7 @@ def _compare(options: Namespace) -> int:
             raise CorrmatError("rooms are procedural: --data and --root go with other protocols")
         about["data"] = "procedural"
     pairs = benchmark.frozen_pairs(**about, root=options.root, count=options.pairs)
-    results = benchmark.compare(pairs, options.models.split(","))
+    results = benchmark.compare(pairs, [name.strip() for name in options.models.split(",")])
     fewer = f", one of each shape: {options.pairs} were asked for"
     print(f"{len(pairs)} pairs{fewer if len(pairs) < options.pairs else ''}")
     print(benchmark.to_table(results))

@@ -69,8 +69,8 @@ COMPARE_EPILOG = """examples:
 protocols: real: disjoint samples, noise, both clouds cropped and with outliers, normals
 estimated; views: what two depth cameras see, up to 60 degrees apart; clean: real without crop
 and outliers; rooms: fragments of procedural rooms (--points 20000); paper: experiment 1.2's
-pairs. kiss is KISS-Matcher, ransac17 RANSAC with as many
-candidates as corrmat has."""
+pairs. kiss is KISS-Matcher, ransac17 RANSAC with
+seventeen candidates; corrmat has up to twenty-five."""
 
 REGISTER_EPILOG = """examples:
   corrmat register scan1.ply scan2.ply

@@ -211,7 +211,7 @@ def _download(repository: str) -> Path:
 
 
 def _load_safetensors(path: Path) -> nn.Module:
-    """Load a file that `ship_network` has written."""
+    """Load weights that ship, that `export_model` wrote, or that came from the Hub."""
     try:
         with safetensors.safe_open(path, framework="pt") as file:
             about = file.metadata() or {}
@@ -257,8 +257,8 @@ def _read_checkpoint(path: Path) -> Mapping[str, Any]:
     """Read a file with torch's loader for weights only."""
     if not path.is_file():
         raise CorrmatError(
-            f"no model {str(path)!r}: neither corrmat, {', '.join(shipped_models())}, icp, ransac, "
-            "fgr, kiss nor a checkpoint file"
+            f"no model {str(path)!r}: neither corrmat, {', '.join(shipped_models())}, "
+            "hf:name/model nor a file or folder of weights"
         )
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
@@ -299,7 +299,10 @@ def checkpoint_network(path: Path) -> tuple[str, dict[str, Any], nn.Module]:
     classes = {method.__name__: method for method in METHODS.values()}
     method = cast("str", content.get("method"))
     if method not in classes:
-        raise CorrmatError(f"{path} is of method {method!r}; methods: {', '.join(classes)}")
+        reason = f"it is of method {method!r}" if method else "it names no method"
+        raise CorrmatError(
+            f"{path} is no checkpoint of corrmat fit: {reason}; methods: {', '.join(classes)}"
+        )
     try:
         hparams = content["hyper_parameters"]["network"]
         network = classes[method].network_type(**hparams)

@@ -67,8 +67,8 @@ def make_room_pair(index: int, points: int, split: Split) -> RoomPair:
     pose = Rotation.random(rng=rng).as_matrix()
     shift = rng.uniform(-2, 2, 3)
     # Each fragment lies in the frame of its own scanner.
-    own = Rotation.random(rng=rng).as_matrix()
-    return RoomPair(source @ own.T, target @ pose.T + shift, pose @ own.T, shift, overlap)
+    frame = Rotation.random(rng=rng).as_matrix()
+    return RoomPair(source @ frame.T, target @ pose.T + shift, pose @ frame.T, shift, overlap)
 
 
 def _room(rng: np.random.Generator) -> tuple[trimesh.Trimesh, np.ndarray]:

@@ -84,7 +84,7 @@ def group_norm_edge_mlp(edges: Tensor, mlp: nn.Sequential) -> Tensor:
     """Apply a shared MLP with group norms to edges (B, P, K, I) and max-pool: (B, P, O).
 
     Args:
-        edges: K edges of each point, at most 32,767.
+        edges: K edges of each point.
         mlp: 1 x 1 convolution, group norm and ReLU a layer, as `networks.pointnet.shared_mlp`.
     """
 
@@ -101,7 +101,7 @@ def group_norm_edge_mlp(edges: Tensor, mlp: nn.Sequential) -> Tensor:
 def linear_max(rows: Tensor, linear: nn.Linear) -> Tensor:
     """Compute the maximum of a linear layer's output over the rows: (B, N, I) to (B, O).
 
-    Equal to `linear(rows).amax(1)`, but of equal maxima one gets the gradient. N is at most 32,767.
+    Equal to `linear(rows).amax(1)`, but of equal maxima one gets the gradient.
     """
     rows = _autocast(rows)
     weight, bias = (t.to(rows.dtype) for t in (linear.weight, linear.bias))

@@ -11,6 +11,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from corrmat.registration.register import Registration
+from corrmat.registration.scene import build_scene
 from corrmat.reporting.figures import BLUE, GREEN, GREY, RED, principal_axes
 from corrmat.reporting.snapshots import thin
 
@@ -43,44 +44,28 @@ def _frames(
     registration: Registration, source: np.ndarray, target: np.ndarray
 ) -> Iterator[Image.Image]:
     """Draw frame by frame, seen so that the target is as wide as it can be."""
-    view, centre = principal_axes(target[:, :3]), target[:, :3].mean(0)
-    rotation, translation = registration.transform[:3, :3], registration.transform[:3, 3]
-    fixed = (target[:, :3] - centre) @ view
-    aligned = (source[:, :3] @ rotation.T + translation - centre) @ view
-    turn_back = Rotation.from_matrix(view.T @ rotation.T @ view).as_rotvec()
-    middle = aligned.mean(0)
-    beside = np.array([np.ptp(fixed, axis=0).max() + np.ptp(aligned, axis=0).max(), 0, 0]) * 0.6
-
-    def at(progress: float) -> np.ndarray:
-        """Return the source: turned as given, beside the target (0), to aligned (1)."""
-        left = 1 - progress
-        return (
-            (aligned - middle) @ Rotation.from_rotvec(left * turn_back).as_matrix().T
-            + middle
-            - left * beside
-        )
-
-    start, count = at(0.0), BEFORE + MATCHES + MOVING + AFTER
-    strongest = np.argsort(-registration.match_confidence, kind="stable")[:MAX_LINES]
-    i, j = registration.matches[strongest].T
+    axes_of_view = principal_axes(target[:, :3])
+    scene = build_scene(registration, source, target, MAX_LINES, axes_of_view)
+    fixed, (i, j) = scene.fixed, scene.matches.T
+    count = BEFORE + MATCHES + MOVING + AFTER
     figure = Figure(SIZE_INCHES, DPI)
     canvas = FigureCanvasAgg(figure)
     axes = figure.add_axes((0.02, 0.02, 0.96, 0.86))
     axes.set_axis_off()
     axes.set_aspect("equal")
     cameras = [_camera(TURN_DEG * (share - 0.5)).T for share in np.linspace(0, 1, count)]
-    corners = np.vstack([start, fixed, aligned])
+    corners = np.vstack([scene.source_at(0), fixed, scene.aligned])
     corners = np.vstack([corners @ camera for camera in cameras])
     (left_end, bottom), (right_end, top) = corners.min(0), corners.max(0)
     axes.set(xlim=(left_end, right_end), ylim=(bottom, top))
     clouds = [axes.scatter([], [], s=5, c=colour, linewidths=0) for colour in (BLUE, RED)]
-    colours = list(np.where(registration.match_agrees[strongest], GREEN, GREY))
+    colours = list(np.where(scene.agrees, GREEN, GREY))
     lines = LineCollection([], colors=colours, lw=0.7, alpha=0.8)
     axes.add_collection(lines)
     title = figure.suptitle("", y=0.97, fontsize=13)
     for frame, camera in enumerate(cameras):
         share = float(np.clip((frame - BEFORE - MATCHES) / MOVING, 0, 1))
-        moved = at(share**2 * (3 - 2 * share))  # starts and stops slowly
+        moved = scene.source_at(share**2 * (3 - 2 * share))  # starts and stops slowly
         clouds[0].set_offsets(thin(fixed, MAX_POINTS) @ camera)
         clouds[1].set_offsets(thin(moved, MAX_POINTS) @ camera)
         shown = BEFORE <= frame <= BEFORE + MATCHES
@@ -99,5 +84,5 @@ def _frames(
 
 def _camera(azimuth_deg: float) -> np.ndarray:
     """Return the projection (2, 3) onto the picture: x, and height seen from slightly above."""
-    turn = Rotation.from_euler("zx", [azimuth_deg, ELEVATION_DEG], degrees=True).as_matrix()
-    return turn[[0, 2]]
+    rotation = Rotation.from_euler("zx", [azimuth_deg, ELEVATION_DEG], degrees=True).as_matrix()
+    return rotation[[0, 2]]

@@ -24,6 +24,9 @@ from corrmat.baselines import (
 from corrmat.errors import CorrmatError
 from corrmat.ops.ransac import best_by_matches, best_distinct, fit_triples
 
+_STRONGEST = 256  # matches that RANSAC draws from
+_INLIER_THRESHOLD = 0.15  # largest residual of a match
+_BY_MATCHES, _BY_AGREEMENT = 16, 8  # hypotheses at most
 _RANKED = 500  # fits that are ranked by agreement
 _ROUGH_POINTS = 64, 256  # of source and target, to rank them by
 _ROUGH_DISTANCE = 0.3  # beyond which two points do not agree
@@ -71,25 +74,14 @@ class NetworkHypotheses:
     explain, and by how well they put the clouds on each other, which right transforms do even
     where most matches are wrong.
 
+    The network's own transform comes on top.
+
     Args:
         network: (source, target) -> Prediction with a correspondence.
-        inlier_threshold: largest residual of a match.
-        num_matches: strongest matches used.
-        count: hypotheses by matches at most; the network's own transform comes on top.
-        count_by_agreement: hypotheses by agreement of the clouds at most.
     """
 
-    def __init__(
-        self,
-        network: nn.Module,
-        inlier_threshold: float = 0.15,
-        num_matches: int = 256,
-        count: int = 16,
-        count_by_agreement: int = 8,
-    ) -> None:
+    def __init__(self, network: nn.Module) -> None:
         self.network = network
-        self.inlier_threshold, self.num_matches = inlier_threshold, num_matches
-        self.count, self.count_by_agreement = count, count_by_agreement
 
     @torch.no_grad()
     def __call__(self, source: np.ndarray, target: np.ndarray, seed: int) -> Hypotheses:
@@ -100,16 +92,16 @@ class NetworkHypotheses:
             return Hypotheses(own_transform, *_NO_MATCHES)
         # The strongest entries that are the maximum of their row or of their column.
         is_max = (prob == prob.amax(0)) | (prob == prob.amax(1, keepdim=True))
-        weight, place = (prob * is_max).flatten().topk(min(self.num_matches, prob.numel()))
+        weight, place = (prob * is_max).flatten().topk(min(_STRONGEST, prob.numel()))
         weight, place = weight[weight > 0], place[weight > 0]
         i, j = place // prob.shape[1], place % prob.shape[1]
-        weighted = x[0, i, :3], y[0, j, :3], weight.sqrt(), self.inlier_threshold
+        weighted = x[0, i, :3], y[0, j, :3], weight.sqrt(), _INLIER_THRESHOLD
         fits = fit_triples(*weighted, generator=torch.Generator().manual_seed(seed))
-        rotation, translation, _ = best_by_matches(*fits, *weighted, self.count)
+        rotation, translation, _ = best_by_matches(*fits, *weighted, _BY_MATCHES)
         transforms = [_matrix(r, t) for r, t in zip(rotation, translation, strict=True)]
         rotation, translation = (t[:_RANKED] for t in fits)
         score = rough_agreement(rotation, translation, x[0], y[0])
-        best = best_distinct(rotation, score, self.count_by_agreement)
+        best = best_distinct(rotation, score, _BY_AGREEMENT)
         transforms += [_matrix(rotation[k], translation[k]) for k in best]
         matches = torch.stack([i, j], 1).numpy()
         return Hypotheses(np.stack([*transforms, *own_transform]), matches, weight.double().numpy())

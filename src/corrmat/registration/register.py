@@ -5,7 +5,7 @@ import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from torch import nn
@@ -102,11 +102,8 @@ def register(
     else:
         generate = CLASSICAL.get(str(model)) or _load_network(str(model))
     start = time.perf_counter()
-    x, y = Cloud.of(source, "source", seed), Cloud.of(target, "target", seed)
-    scale = 2 * MEDIAN / (x.median + y.median)
-    subsamples = x.with_normals(scale, MODEL_POINTS), y.with_normals(scale, MODEL_POINTS)
+    (x, y), scale, subsamples, scorer = prepare_clouds(source, target, seed)
     hypotheses = generate(*subsamples, seed)
-    scorer = AlignmentScorer(x.points(scale, SELECTION_POINTS), y.points(scale, SELECTION_POINTS))
     transforms, measures = measure_candidates(hypotheses, subsamples, scorer, refine)
     best = int(np.argmax(measures @ [1.0, COHERENCE_WEIGHT, SUPPORT_WEIGHT]))
     transform, (agreement, _, support) = transforms[best], measures[best].tolist()
@@ -132,6 +129,24 @@ def register(
         seed=seed,
         seconds=time.perf_counter() - start,
     )
+
+
+class PreparedClouds(NamedTuple):
+    """Two clouds as the model and the choice among its hypotheses see them."""
+
+    clouds: "tuple[Cloud, Cloud]"
+    scale: float  # from the user's units to those in which a cloud's radius is about one
+    subsamples: tuple[np.ndarray, np.ndarray]  # (N, 6) and (M, 6), for the model
+    scorer: AlignmentScorer
+
+
+def prepare_clouds(source: np.ndarray, target: np.ndarray, seed: int) -> PreparedClouds:
+    """Check, centre, scale and subsample two clouds; see `register`."""
+    x, y = Cloud.of(source, "source", seed), Cloud.of(target, "target", seed)
+    scale = 2 * MEDIAN / (x.median + y.median)
+    subsamples = x.with_normals(scale, MODEL_POINTS), y.with_normals(scale, MODEL_POINTS)
+    scorer = AlignmentScorer(x.points(scale, SELECTION_POINTS), y.points(scale, SELECTION_POINTS))
+    return PreparedClouds((x, y), scale, subsamples, scorer)
 
 
 def measure_candidates(
@@ -259,11 +274,22 @@ def _calibration() -> Calibration:
 
 
 def _load_network(model: str) -> NetworkHypotheses:
-    """Load a model, kept in memory until its file changes."""
+    """Load a model, kept in memory until its file changes.
+
+    Raises:
+        CorrmatError: there is no such model.
+    """
     path = Path(model)
     path = path / "model.safetensors" if path.is_dir() else path  # what `corrmat export` wrote
     stat = path.stat() if path.is_file() else None
-    return _cached_network(model, stat and (str(path.resolve()), stat.st_mtime_ns, stat.st_size))
+    try:
+        return _cached_network(
+            model, stat and (str(path.resolve()), stat.st_mtime_ns, stat.st_size)
+        )
+    except CorrmatError as error:
+        if path.exists() or model.startswith("hf:"):
+            raise
+        raise CorrmatError(f"{error}; classical pipelines: {', '.join(CLASSICAL)}") from error
 
 
 @functools.lru_cache(maxsize=4)

@@ -108,5 +108,5 @@ class AlignmentScorer:
         rotation, translation = transform[:3, :3], transform[:3, 3]
         moved = self.source @ rotation.T + translation
         back = (self.target - translation) @ rotation
-        found = self._trees[1].query(moved), self._trees[0].query(back)
-        return [(np.asarray(distance), np.asarray(index)) for distance, index in found]
+        queries = self._trees[1].query(moved), self._trees[0].query(back)
+        return [(np.asarray(distance), np.asarray(index)) for distance, index in queries]

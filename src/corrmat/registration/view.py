@@ -4,9 +4,9 @@ import json
 
 import numpy as np
 import plotly.graph_objects as go
-from scipy.spatial.transform import Rotation
 
 from corrmat.registration.register import Registration
+from corrmat.registration.scene import build_scene
 from corrmat.reporting.figures import BLUE, GREEN, GREY, RED
 from corrmat.reporting.html import render
 from corrmat.reporting.snapshots import thin
@@ -23,24 +23,15 @@ def registration_page(registration: Registration, source: np.ndarray, target: np
         source: (N, 3 or more), as given to `register`.
         target: (M, 3 or more).
     """
-    # Far from the origin a browser's float32 would lose the detail.
-    origin = target[:, :3].mean(0)
-    rotation, translation = registration.transform[:3, :3], registration.transform[:3, 3]
-    aligned = source[:, :3] @ rotation.T + translation - origin
-    fixed = target[:, :3] - origin
-    strongest = np.argsort(-registration.match_confidence, kind="stable")[:MAX_LINES]
-    i, j = registration.matches[strongest].T
-    agrees = registration.match_agrees[strongest]
+    scene = build_scene(registration, source, target, MAX_LINES)
+    fixed, aligned, (i, j) = scene.fixed, scene.aligned, scene.matches.T
     figure = go.Figure([_points(fixed, "target", BLUE), _points(aligned, "source", RED)])
     for name, chosen, colour in (
-        ("matches that agree", agrees, GREEN),
-        ("other matches", ~agrees, GREY),
+        ("matches that agree", scene.agrees, GREEN),
+        ("other matches", ~scene.agrees, GREY),
     ):
         figure.add_trace(_lines(aligned[i[chosen]], fixed[j[chosen]], name, colour))
-    middle = aligned.mean(0)
-    beside = 0.6 * float(np.ptp(fixed, axis=0).max() + np.ptp(aligned, axis=0).max())
-    before = (aligned - middle) @ rotation + middle - [beside, 0, 0]
-    everything = np.vstack([fixed, aligned, before])
+    everything = np.vstack([fixed, aligned, scene.source_at(0)])
     axes = {
         f"{axis}axis": {"visible": False, "range": [low, high]}  # the same all along the way
         for axis, low, high in zip("xyz", everything.min(0), everything.max(0), strict=True)
@@ -53,9 +44,9 @@ def registration_page(registration: Registration, source: np.ndarray, target: np
         scene={**axes, "aspectmode": "data", "camera": {"eye": {"x": 0.3, "y": -1.4, "z": 0.7}}},
     )
     motion = {
-        "middle": middle.tolist(),
-        "turn": Rotation.from_matrix(rotation.T).as_rotvec().tolist(),
-        "beside": beside,
+        "middle": aligned.mean(0).tolist(),
+        "turn": scene.rotvec.tolist(),
+        "beside": scene.beside,
     }
     return render(
         "registration.html.j2",

@@ -31,9 +31,9 @@ def comparison_summary(results: Path, points: int = 512) -> str:
     for record in records:
         cells = []
         for model in models:
-            right = _within_angle(record["models"][model])
-            interval = f" ({_wilson(right)})" if model == OURS else ""
-            cells.append(f"{right.mean():.0%}{interval}")
+            hits = _within_angle(record["models"][model])
+            interval = f" ({_wilson(hits)})" if model == OURS else ""
+            cells.append(f"{hits.mean():.0%}{interval}")
         lines.append(markdown_row([record["protocol"], record["data"], *cells]))
     return "\n".join(lines)
 
@@ -49,9 +49,9 @@ def comparison_table(results: Path) -> str:
     for record in _read_comparisons(results):
         ours = _within_angle(record["models"][OURS])
         for model, row in record["models"].items():
-            right = _within_angle(row)
-            recalls = [f"{r.mean():.0%} ({_wilson(r)})" for r in (right, _aligned(row))]
-            p = "" if model == OURS else f"{_mcnemar(ours, right):.2g}"
+            hits = _within_angle(row)
+            recalls = [f"{r.mean():.0%} ({_wilson(r)})" for r in (hits, _aligned(row))]
+            p = "" if model == OURS else f"{_mcnemar(ours, hits):.2g}"
             start = [record["protocol"], record["data"], str(record["points"]), model]
             lines.append(markdown_row([*start, *recalls, p, f"{row['ms']:.0f}"]))
     return "\n".join(lines)
@@ -208,8 +208,8 @@ def _read_comparisons(results: Path) -> list[dict]:
     """Read the comparisons of all protocols, in the order of the tables."""
     paths = (results / "register").glob("*-*-*.json")
     records = [json.loads(path.read_text()) for path in paths]
-    known = [record for record in records if record["protocol"] in _PROTOCOLS]
-    return sorted(known, key=lambda r: (_PROTOCOLS.index(r["protocol"]), r["data"], r["points"]))
+    kept = [record for record in records if record["protocol"] in _PROTOCOLS]
+    return sorted(kept, key=lambda r: (_PROTOCOLS.index(r["protocol"]), r["data"], r["points"]))
 
 
 def _within_angle(row: dict) -> np.ndarray:
@@ -227,9 +227,9 @@ def _confidence(row: dict) -> np.ndarray:
     return np.array([calibration.confidence(*score) for score in scores])
 
 
-def _wilson(right: np.ndarray) -> str:
+def _wilson(hits: np.ndarray) -> str:
     """Format Wilson's 95 % interval of a share, in per cent."""
-    interval = stats.binomtest(int(right.sum()), len(right)).proportion_ci(0.95, "wilson")
+    interval = stats.binomtest(int(hits.sum()), len(hits)).proportion_ci(0.95, "wilson")
     return f"{100 * interval.low:.0f} to {100 * interval.high:.0f}"
 
 

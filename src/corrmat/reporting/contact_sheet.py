@@ -8,16 +8,18 @@ from matplotlib.figure import Figure
 from corrmat.data.clouds import CloudSet
 from corrmat.reporting.figures import save
 
+COLUMNS = 8
 
-def draw_contact_sheet(clouds: CloudSet, path: Path, columns: int = 8) -> None:
+
+def draw_contact_sheet(clouds: CloudSet, path: Path) -> None:
     """Write a PNG with the first shape of each category, shaded by its normals."""
     members = [np.flatnonzero(clouds.labels == label) for label in range(len(clouds.names))]
     tiles = [(name, i[0]) for name, i in zip(clouds.names, members, strict=True) if len(i)]
-    rows = -(-len(tiles) // columns)
-    figure = Figure(figsize=(1.9 * columns, 2.0 * rows), layout="constrained")
+    rows = -(-len(tiles) // COLUMNS)
+    figure = Figure(figsize=(1.9 * COLUMNS, 2.0 * rows), layout="constrained")
     light = np.array([0.4, -0.7, 0.6]) / np.linalg.norm([0.4, -0.7, 0.6])
     for place, (name, index) in enumerate(tiles):
-        axes = figure.add_subplot(rows, columns, place + 1, projection="3d", computed_zorder=False)
+        axes = figure.add_subplot(rows, COLUMNS, place + 1, projection="3d", computed_zorder=False)
         shape = clouds.rows[int(index)]
         x, y, z = shape[:, :3].T
         shade = 0.25 + 0.75 * np.abs(shape[:, 3:] @ light)

@@ -41,10 +41,10 @@ def draw_matrices(results: Path) -> bytes | None:
     for axes, model in zip(figure.subplots(1, 2), ARMS, strict=True):
         correspondence = load_model(model)(source, target).correspondence
         prob = correspondence.prob()[0].numpy()[np.ix_(rows, columns)]
-        right = (correspondence.argmax()[0].numpy() == match).mean()
+        correct = (correspondence.argmax()[0].numpy() == match).mean()
         axes.imshow(prob, cmap="magma", vmin=0, vmax=prob.max())
         name = model.split("/")[1]
         loss = "the correspondence matrix" if name.endswith("_corr") else "the transform"
-        axes.set_title(f"trained on {loss}: {right:.0%} right", fontsize="medium")
+        axes.set_title(f"trained on {loss}: {correct:.0%} right", fontsize="medium")
         axes.set(xlabel="target points", ylabel="source points", xticks=[], yticks=[])
     return to_png(figure)

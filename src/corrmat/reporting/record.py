@@ -180,9 +180,9 @@ def read_record(path: Path) -> Record:
         raise CorrmatError(f"{path} is no record, or cut short: {error}") from error
 
 
-def read_records(results: Path, scale: str = "*") -> list[Record]:
+def read_records(results: Path) -> list[Record]:
     """Read every record below a folder, ordered by scale, experiment, data and seed."""
-    records = [read_record(path) for path in results.glob(f"{scale}/*/*/metrics.json")]
+    records = [read_record(path) for path in results.glob("*/*/*/metrics.json")]
     return sorted(records, key=lambda r: (r.scale, r.id, r.data, r.seed))
 
 

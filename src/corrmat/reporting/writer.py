@@ -115,8 +115,8 @@ def _baseline_result(
         return abs(float(row["rotation_error_deg"]) - snapshot.rotation_error_deg)
 
     # In 1.4 and 2.4 every rotation band has a pair of this shape.
-    own = [row for row in rows if row["arm"] == snapshot.arm]
-    band = min(own, key=distance)["band"] if own else None
+    same_arm = [row for row in rows if row["arm"] == snapshot.arm]
+    band = min(same_arm, key=distance)["band"] if same_arm else None
     for row in rows:
         if (row["arm"], row["band"]) == (record.baseline, band):
             values = [float(number) for number in row["transform"].split()]

@@ -1,0 +1,63 @@
+"""What the page and the animation of a registration draw: two clouds, matches, and the motion."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from corrmat.registration.register import Registration
+
+BESIDE = 0.6  # of both clouds' largest extents: how far the source starts from the target
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A registration in the target's frame, about the target's centroid.
+
+    Far from the origin a browser's float32 would lose the detail.
+    """
+
+    fixed: np.ndarray  # (M, 3) the target
+    aligned: np.ndarray  # (N, 3) the source where it ends
+    rotvec: np.ndarray  # (3,) rotation vector from where it ends to as it was given
+    beside: float  # how far to the left it starts, so that the clouds do not hide each other
+    matches: np.ndarray  # (K, 2) rows of source and target, the most confident first
+    agrees: np.ndarray  # (K,) bool: whether the transform takes one end near the other
+
+    def source_at(self, progress: float) -> np.ndarray:
+        """Return the source (N, 3): as given, beside the target (0), to aligned (1)."""
+        left, middle = 1 - progress, self.aligned.mean(0)
+        rotation = Rotation.from_rotvec(left * self.rotvec).as_matrix()
+        return (self.aligned - middle) @ rotation.T + middle - [left * self.beside, 0, 0]
+
+
+def build_scene(
+    registration: Registration,
+    source: np.ndarray,
+    target: np.ndarray,
+    max_matches: int,
+    axes: np.ndarray | None = None,
+) -> Scene:
+    """Build the scene of a registration.
+
+    Args:
+        registration: of the source onto the target.
+        source: (N, 3 or more), as given to `register`.
+        target: (M, 3 or more).
+        max_matches: the most confident ones that are kept.
+        axes: (3, 3), the columns are axes of the scene; those of the target's frame if None.
+    """
+    axes = np.eye(3) if axes is None else axes
+    origin = target[:, :3].mean(0)
+    rotation, translation = registration.transform[:3, :3], registration.transform[:3, 3]
+    fixed = (target[:, :3] - origin) @ axes
+    aligned = (source[:, :3] @ rotation.T + translation - origin) @ axes
+    strongest = np.argsort(-registration.match_confidence, kind="stable")[:max_matches]
+    return Scene(
+        fixed,
+        aligned,
+        rotvec=Rotation.from_matrix(axes.T @ rotation.T @ axes).as_rotvec(),
+        beside=BESIDE * float(np.ptp(fixed, axis=0).max() + np.ptp(aligned, axis=0).max()),
+        matches=registration.matches[strongest],
+        agrees=registration.match_agrees[strongest],
+    )
