@@ -193,7 +193,8 @@ def _safetensors_file(model: str) -> Path | None:
         return _shipped_file(model)
     if model.startswith("hf:"):
         return _download(model.removeprefix("hf:"))
-    exported = Path(model) / _MODEL_FILE
+    path = Path(model)
+    exported = path if path.suffix == ".safetensors" else path / _MODEL_FILE
     return exported if exported.is_file() else None
 
 

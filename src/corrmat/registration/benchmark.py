@@ -88,7 +88,7 @@ def frozen_pairs(
         root: folder of the data set.
         points: of a cloud before it is cropped.
         count: of pairs, spread over the shapes of the split.
-        split: "test", or "val" (training shapes) to choose settings on.
+        split: "test"; or "val", training shapes, to tune what was not trained on them.
 
     Raises:
         CorrmatError: the data set cannot be read, or has too few points.

@@ -85,7 +85,8 @@ def choice_table(results: Path) -> str:
         shares = [f"{row['recall_5deg']:.1%}, {row['recall_adds']:.1%}" for row in tried]
         lines.append(markdown_row([weights, *shares]))
     counts = ", ".join(f"{record[name]['pairs']} {name}" for name in protocols)
-    return "\n".join([*lines, "", f"{counts} pairs."])
+    means = ", ".join(f"{record[name]['candidates']:.0f} ({name})" for name in protocols)
+    return "\n".join([*lines, "", f"{counts} pairs. Candidates a pair, in the mean: {means}."])
 
 
 def confidence_table(results: Path) -> str:
