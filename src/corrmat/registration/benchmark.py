@@ -168,7 +168,8 @@ def write_results(
     """Write the record of a comparison, with what it was made on."""
     path.parent.mkdir(parents=True, exist_ok=True)
     models = {name: asdict(result) for name, result in results.items()}
-    content = {**about, "commit": commit(), "models": models}
+    hardware = {"threads": torch.get_num_threads(), "cpu": torch.backends.cpu.get_cpu_capability()}
+    content = {**about, "commit": commit(), "hardware": hardware, "models": models}
     replace_text(path, json.dumps(content, indent=1) + "\n")
 
 

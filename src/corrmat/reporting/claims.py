@@ -24,7 +24,7 @@ from corrmat.reporting.intervals import (
     read_errors,
 )
 from corrmat.reporting.record import Record
-from corrmat.reporting.tables import markdown_row, paper_metric
+from corrmat.reporting.tables import markdown_row, paper_metric, ratio_cell
 
 Verdict = Literal["confirmed", "confirmed in direction", "not shown", "contradicted"]
 LEFT_BASELINE = 0.5  # of identity's median error: an arm above it has learnt nothing to compare
@@ -136,12 +136,14 @@ def headline(evidence: Evidence) -> list[str]:
     arms = [_text(median_rotation(e), "deg") for e in (evidence.baseline, evidence.treatment)]
     judged = less_error(evidence)
     pairs = record.arms[record.treatment].pairs_seen
+    by_paper_metric = [record.arms[a].overall(paper_metric(record)) for a in record.compared]
     ransac = evidence.errors.get("ransac")
     return [
         f"{record.id} {record.family}, {record.title}",
         *arms,
         f"{ransac.median_deg:.2g} deg" if ransac else "",
         _text(ratio_of_medians(evidence.baseline, evidence.treatment)),
+        ratio_cell(by_paper_metric),
         judged.paper.rpartition(": ")[2].removesuffix(" times"),
         f"{pairs:,} pairs, {record.data}",
         f"**{judged.verdict}**",
@@ -167,10 +169,15 @@ def sooner(evidence: Evidence) -> Claim | None:
     reached = "never" if math.isinf(needed) else f"after {needed:,.0f}"
     reached += ", its first validation" if at_once else ""
     goal_text = f"{goal:.3g} deg in validation, {record.baseline}'s best"
+    control = _high_rate_control(record)
+    best_at_high_rate = ""
+    if control is not None and record.arms[control].curve:
+        error = np.nanmin([point[name] for point in record.arms[control].curve])
+        best_at_high_rate = f"; {control}'s best is {error:.3g} deg"
     return Claim(
         f"{record.id}: {record.treatment} converges sooner",
         "half the epochs (1.1)",
-        f"{goal_text} of {baseline.pairs_seen:,} pairs: reached {reached}",
+        f"{goal_text} of {baseline.pairs_seen:,} pairs: reached {reached}{best_at_high_rate}",
         evidence.where,
         verdict,
     )

@@ -13,6 +13,7 @@ from corrmat.calibration import shipped_calibration, verdict
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG
 from corrmat.reporting.figures import BLUE, GREEN, RED, save
 from corrmat.reporting.tables import markdown_row
+from corrmat.weights import shipped_metadata
 
 OURS = "corrmat"
 _PROTOCOLS = ("real", "views", "clean", "rooms")  # in the order of the tables
@@ -58,16 +59,23 @@ def comparison_table(results: Path) -> str:
 
 
 def networks_table(results: Path) -> str:
-    """Build the table of other networks of this project in the shipped one's place."""
+    """Build the table of other networks of this project in the shipped one's place.
+
+    The p value is the exact McNemar test's against the shipped network, on the same pairs.
+    """
     path = results / "register" / "networks.json"
     if not path.is_file():
         return "No comparison is recorded."
-    lines = [markdown_row(["network", "recall at 5 deg", "recall ADD-S"]), "|---|---|---|"]
-    for name, row in json.loads(path.read_text())["models"].items():
-        parts = Path(name).parts
-        label = f"{parts[-1]}, experiment {parts[-2]}" if len(parts) > 1 else f"{name} (shipped)"
-        recalls = [f"{row['recall_5deg']:.0%}", f"{row['recall_adds']:.0%}"]
-        lines.append(markdown_row([label, *recalls]))
+    heads = ["network", "its record", "within 5 deg", "ADD-S", "p"]
+    lines = [markdown_row(heads), "|" + "---|" * len(heads)]
+    models = json.loads(path.read_text())["models"]
+    ours = _within_angle(models[OURS])
+    for name, row in models.items():
+        hits = _within_angle(row)
+        recalls = [f"{r.mean():.0%} ({_wilson(r)})" for r in (hits, _aligned(row))]
+        record = "" if name == OURS else shipped_metadata(name)["record"]
+        p = "" if name == OURS else f"{_mcnemar(ours, hits):.2g}"
+        lines.append(markdown_row([Path(name).name, record, *recalls, p]))
     return "\n".join(lines)
 
 
@@ -174,7 +182,7 @@ def _recall_line(runs: list[dict], protocol: str) -> tuple[float, float]:
 
 
 def draw_training(results: Path) -> None:
-    """Draw how the shipped weights were trained: loss, and recall on validation pairs.
+    """Draw how the shipped weights were trained: loss, and recall on held-out pairs.
 
     A dotted line is the fit of `doubling_summary`, as far as twice the pairs.
     Nothing is drawn where results/register/training.json is missing.
@@ -195,7 +203,7 @@ def draw_training(results: Path) -> None:
             slope, intercept = _recall_line(runs, protocol)
             recall.plot(ends, slope * np.log2(ends) + intercept, ":", color=colour)
     loss.set(title="training loss", xlabel="pairs seen")
-    recall.set(title="within 5 degrees, validation, %", xlabel="pairs seen", xscale="log")
+    recall.set(title="within 5 degrees, held out, %", xlabel="pairs seen", xscale="log")
     recall.set_xticks([*(run["pairs"] for run in runs), 2 * runs[-1]["pairs"]])
     recall.xaxis.set_minor_locator(NullLocator())
     figure.legend(*recall.get_legend_handles_labels(), loc="outside lower center", ncols=3)

@@ -14,7 +14,7 @@ from corrmat.reporting.html import render
 from corrmat.reporting.overview import draw_overview, longest_records
 from corrmat.reporting.provenance import command, staleness
 from corrmat.reporting.record import Record, read_records, read_snapshots
-from corrmat.reporting.tables import METRICS, cell, effort, paper_metric, ratio, table
+from corrmat.reporting.tables import METRICS, cell, effort, paper_metric, ratio_cell, table
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 
@@ -89,9 +89,9 @@ def _summary_rows(record: Record) -> list[dict[str, object]]:
                 "anchor": _name(record),
                 "title": f"{metric} in {_source(record)}; {command(record)}",
                 "ours": [cell(value, metric) for value in ours],
-                "ratio": ratio(ours),
+                "ratio": ratio_cell(ours),
                 "paper": [cell(value, metric) for value in paper],
-                "paper_ratio": ratio(paper),
+                "paper_ratio": ratio_cell(paper),
             }
         )
     return rows

@@ -87,9 +87,9 @@ def _row_of(
     if all(value is None for value in ours):
         return []
     by_arm = dict(zip(record.arms, ours, strict=True))
-    ratio_of_arms = ratio([by_arm[arm] for arm in record.compared])
+    ratio_of_arms = ratio_cell([by_arm[arm] for arm in record.compared])
     texts = [[cell(value, name) for value in group] for group in (ours, others, theirs)]
-    return [heading, *texts[0], ratio_of_arms, *texts[1], *texts[2], ratio(theirs)]
+    return [heading, *texts[0], ratio_of_arms, *texts[1], *texts[2], ratio_cell(theirs)]
 
 
 def terminal_table(record: Record) -> str:
@@ -133,7 +133,7 @@ def markdown_summary(records: Sequence[Record]) -> str:
             lines.append(markdown_row(cells))
         cells = _arrows(same[0], list(same[0].as_printed.values()))
         if any(cells):
-            start = [f"{identity} {same[0].family}, as printed", "ModelNet40"]
+            start = [f"{identity} {same[0].family}, the paper", "ModelNet40"]
             lines.append(markdown_row([*start, *cells, ""]))
     return "\n".join(lines)
 
@@ -163,7 +163,7 @@ def markdown_row(cells: Sequence[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def ratio(values: Sequence[float | None]) -> str:
+def ratio_cell(values: Sequence[float | None]) -> str:
     """Format the ratio of METHOD to METHOD_corr; empty if one is missing."""
     if len(values) < 2 or values[0] is None or not values[1]:
         return ""
