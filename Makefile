@@ -78,7 +78,7 @@ format: .venv/ready  ## let ruff rewrite what it can
 	$(BIN)/ruff check --fix . && $(BIN)/ruff format .
 
 test: .venv/ready  ## everything but the slow learning tests, smoke training of every experiment included
-	$(BIN)/pytest --nbmake tests notebooks
+	$(BIN)/pytest --numprocesses auto --maxprocesses 8 --dist worksteal --nbmake tests notebooks
 
 test-slow: .venv/ready  ## learning, kill -9 at any moment, SLURM, Ray, all checksums
 	$(BIN)/pytest -m slow

@@ -1,5 +1,6 @@
 """A set of clean clouds, in memory or in shards on disk."""
 
+import io
 import json
 import logging
 import os
@@ -12,7 +13,7 @@ import numpy as np
 import platformdirs
 
 from corrmat.errors import CorrmatError
-from corrmat.files import replace_text
+from corrmat.files import replace_bytes, replace_text
 
 log = logging.getLogger("corrmat")
 _INDEX = "index.json"  # written last: a folder without it is not complete
@@ -157,15 +158,11 @@ def write_shard(
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = _shard(folder, number)
-    partial = path.with_suffix(f".{os.getpid()}.partial")
-    try:
-        with partial.open("wb") as file:
-            np.save(file, np.ascontiguousarray(rows, np.float32))
-        about = {"labels": labels.tolist(), "crc32": _crc(partial), "skipped": list(skipped)}
-        partial.replace(path)
-        replace_text(path.with_suffix(".json"), json.dumps(about))
-    finally:
-        partial.unlink(missing_ok=True)
+    content = io.BytesIO()
+    np.save(content, np.ascontiguousarray(rows, np.float32))
+    replace_bytes(path, content.getbuffer())
+    about = {"labels": labels.tolist(), "crc32": _crc(path), "skipped": list(skipped)}
+    replace_text(path.with_suffix(".json"), json.dumps(about))
 
 
 def missing_shards(folder: Path, count: int) -> list[int]:
