@@ -306,6 +306,15 @@ def test_other_settings_do_not_go_on_from_an_old_checkpoint(tmp_path, capsys):
     assert (tmp_path / "DCP.previous" / "last.ckpt").read_bytes() == old  # nothing is lost
 
 
+def test_the_commit_is_read_before_training_and_not_after(tmp_path, monkeypatch):
+    """Hours later the files may be another commit's, but the code in memory is not."""
+    runs = tmp_path / "runs"
+    for module in (fit, experiment):
+        monkeypatch.setattr(module, "commit", lambda: f"{len(list(runs.rglob('*.ckpt')))} saved")
+    record = experiment.run(load("1.2"), tmp_path / "results", runs)
+    assert (record.commit, record.arms["DCP"].trained_at) == ("0 saved", "0 saved")
+
+
 def test_an_arm_that_was_finished_is_not_trained_again_before_its_record(tmp_path, capsys):
     """Ctrl-C in the second arm costs nothing of the first; a recorded run starts anew."""
     loaded = load("1.1")

@@ -1,6 +1,7 @@
 """Trained arms in the package: they load, and they match what their records say."""
 
 import json
+import shutil
 import sys
 import types
 
@@ -43,6 +44,11 @@ def test_a_recorded_arm_is_shipped_and_loads_by_name(tmp_path, monkeypatch):
     assert json.loads(about["network"])["width"] == 32
     with pytest.raises(CorrmatError, match="neither corrmat, 1.2/DCP, 1.2/DCP_corr"):
         corrmat.load_model("1.2/PCRNet")
+    path = ROOT / "configs" / "exp" / "1.2.yaml"
+    other = recipe.load(path, "smoke", {"data": {"name": "mine"}})
+    for folder in (results, runs):
+        shutil.copytree(folder / loaded.place, folder / other.place)
+    assert shipping.ship_arms(other, results, runs) == []  # the package has weights of shapes
     monkeypatch.setattr(shipping, "_shipped_scale", lambda model: recipe.SCALES.index("laptop"))
     assert shipping.ship_arms(loaded, results, runs) == []  # weights of a larger scale are kept
 
