@@ -30,7 +30,7 @@ def package(tmp_path, monkeypatch):
     copy.parent.mkdir()
     shutil.copy(weights.SHIPPED, copy)
     monkeypatch.setattr(weights, "SHIPPED", copy)
-    monkeypatch.setattr(shipping, "CALIBRATION_PAIRS", 9)
+    monkeypatch.setattr(shipping, "CALIBRATION_PAIRS", {512: 3})
     monkeypatch.setattr("corrmat.data.shapes.dataset.SIZE", {"train": 200, "test": 10})
     monkeypatch.setattr("corrmat.data.shapes.dataset.ASSEMBLIES", {"train": 20, "test": 10})
     return copy

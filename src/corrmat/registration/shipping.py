@@ -1,5 +1,6 @@
 """A trained checkpoint becomes the weights of the package: tensors and a calibration."""
 
+import itertools
 import json
 from collections.abc import Mapping
 from dataclasses import replace
@@ -18,7 +19,7 @@ from corrmat.registration import benchmark
 from corrmat.revision import commit
 from corrmat.types import PairBatch
 
-CALIBRATION_PAIRS = 600
+CALIBRATION_PAIRS = {512: 200, 1024: 100}  # of a protocol, by points of a cloud
 _TRAINING = Path("register", "training.json")  # below results/
 _PROTOCOLS: tuple[benchmark.Protocol, ...] = ("real", "views", "clean")
 
@@ -85,15 +86,14 @@ def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:
         model: as `register` takes it.
 
     Returns:
-        Coefficients over (agreement, support, 1) and over (agreement, 1); and the share of the
-        pairs of each protocol that are within 5 degrees.
+        Coefficients over (agreement, support, 1) and over (agreement, 1); and the share of each
+        protocol's pairs of 512 points that are within 5 degrees.
     """
     scores, aligned, recalls = [], [], {}
-    for protocol in _PROTOCOLS:
-        count = CALIBRATION_PAIRS // len(_PROTOCOLS)
-        pairs = held_out_pairs(protocol, count, seed=0)
+    for protocol, points in itertools.product(_PROTOCOLS, CALIBRATION_PAIRS):
+        pairs = held_out_pairs(protocol, CALIBRATION_PAIRS[points], seed=0, points=points)
         result = benchmark.compare(pairs, [model])[model]
-        recalls[protocol] = result.recall_5deg
+        recalls.setdefault(protocol, result.recall_5deg)
         scores += zip(result.per_pair["agreement"], result.per_pair["support"], strict=True)
         aligned += [distance < ADDS_THRESHOLD for distance in result.per_pair["adds"]]
     x = np.column_stack([np.array(scores), np.ones(len(scores))])
@@ -101,19 +101,23 @@ def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:
     return {"both": _fit_logistic(x, y), "agreement": _fit_logistic(x[:, [0, 2]], y)}, recalls
 
 
-def held_out_pairs(protocol: benchmark.Protocol, count: int, seed: int) -> PairBatch:
-    """Make pairs of 512 points of the families' shapes that `make weights` does not train on.
+def held_out_pairs(
+    protocol: benchmark.Protocol, count: int, seed: int, points: int = 512
+) -> PairBatch:
+    """Make pairs of the families' shapes that `make weights` does not train on.
 
     Args:
         protocol: one of `benchmark.PROTOCOLS`.
         count: of pairs, spread over the shapes.
         seed: of crops, noise and poses.
+        points: of a cloud before it is cropped.
     """
     clouds = RegistrationDataModule(data="shapes+assemblies").clouds("val")
     families = np.flatnonzero([clouds.names[label] != "assembly" for label in clouds.labels])
     chosen = families[np.linspace(0, len(families) - 1, count).round().astype(int)].tolist()
     keys = [Key(seed, STREAM["val"], 0, shape) for shape in chosen]
-    return make_pairs(clouds, chosen, keys, replace(benchmark.PROTOCOLS[protocol], num_points=512))
+    settings = replace(benchmark.PROTOCOLS[protocol], num_points=points)
+    return make_pairs(clouds, chosen, keys, settings)
 
 
 def _fit_logistic(x: np.ndarray, y: np.ndarray) -> list[float]:
