@@ -162,7 +162,7 @@ def committed():
 
 
 @pytest.mark.parametrize(
-    ("page", "name", "content"), documents.TABLES, ids=lambda value: str(value)
+    ("page", "name", "content"), documents.TABLES, ids=[name for _, name, _ in documents.TABLES]
 )
 def test_the_documents_say_what_the_records_say(page, name, content, committed):
     """Fails when a record is committed and `make docs` was not run.
