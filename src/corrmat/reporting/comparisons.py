@@ -50,11 +50,9 @@ def comparison_table(results: Path) -> str:
     for record in _read_comparisons(results):
         ours = _within_angle(record["models"][OURS])
         for model, row in record["models"].items():
-            hits = _within_angle(row)
-            recalls = [f"{r.mean():.0%} ({_wilson(r)})" for r in (hits, _aligned(row))]
-            p = "" if model == OURS else f"{_mcnemar(ours, hits):.2g}"
             start = [record["protocol"], record["data"], str(record["points"]), model]
-            lines.append(markdown_row([*start, *recalls, p, f"{row['ms']:.0f}"]))
+            recalls = _recall_cells(row, None if model == OURS else ours)
+            lines.append(markdown_row([*start, *recalls, f"{row['ms']:.0f}"]))
     return "\n".join(lines)
 
 
@@ -71,11 +69,9 @@ def networks_table(results: Path) -> str:
     models = json.loads(path.read_text())["models"]
     ours = _within_angle(models[OURS])
     for name, row in models.items():
-        hits = _within_angle(row)
-        recalls = [f"{r.mean():.0%} ({_wilson(r)})" for r in (hits, _aligned(row))]
         record = "" if name == OURS else shipped_metadata(name)["record"]
-        p = "" if name == OURS else f"{_mcnemar(ours, hits):.2g}"
-        lines.append(markdown_row([Path(name).name, record, *recalls, p]))
+        recalls = _recall_cells(row, None if name == OURS else ours)
+        lines.append(markdown_row([Path(name).name, record, *recalls]))
     return "\n".join(lines)
 
 
@@ -234,6 +230,13 @@ def _confidence(row: dict) -> np.ndarray:
     calibration = shipped_calibration()
     scores = zip(row["per_pair"]["agreement"], row["per_pair"]["support"], strict=True)
     return np.array([calibration.confidence(*score) for score in scores])
+
+
+def _recall_cells(row: dict, ours: np.ndarray | None) -> list[str]:
+    """Format both recalls of a model with intervals, and its p value against our hits, if given."""
+    hits = _within_angle(row)
+    recalls = [f"{r.mean():.0%} ({_wilson(r)})" for r in (hits, _aligned(row))]
+    return [*recalls, "" if ours is None else f"{_mcnemar(ours, hits):.2g}"]
 
 
 def _wilson(hits: np.ndarray) -> str:
