@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from corrmat.data import datamodule as datamodules
 from corrmat.data.clouds import CloudSet
 from corrmat.data.datamodule import RegistrationDataModule
 from corrmat.data.pairs import Key, PairSettings, Purpose, generator, make_pairs
@@ -252,6 +253,37 @@ def test_a_tenth_of_train_is_held_out_by_seed():
     assert len(kept) == 22
     assert not held[0] & kept
     assert held[0] == held[1] != held[2]
+
+
+def test_every_epoch_has_new_shapes_of_the_same_categories(monkeypatch):
+    data = {"data": "shapes+assemblies", "train_shapes": 90, "num_points": 64, "batch_size": 4}
+    module = RegistrationDataModule(**data, new_shapes=True, normals="estimated")
+    known, made, sample_shape = module.clouds("train"), [], datamodules.sample_shape
+
+    def remember(name, rng):
+        made.append(name)
+        return sample_shape(name, rng)
+
+    monkeypatch.setattr(datamodules, "sample_shape", remember)
+    dataset = module.train_dataloader().dataset
+    items = [(epoch, shape) for epoch in range(2) for shape in (0, 1, 80)]
+    shapes = np.concatenate([dataset[item].clean.numpy() for item in items])
+    assert made == [known.names[known.labels[shape]] for _, shape in items]
+    again = np.concatenate([dataset[item].clean.numpy() for item in items])
+    np.testing.assert_array_equal(shapes, again)
+    everything = np.concatenate([known.rows[:, :, :3], shapes]).reshape(len(known) + 6, -1)
+    assert len(np.unique(everything, axis=0)) == len(everything)
+
+
+def test_shapes_held_out_do_not_depend_on_the_seed_where_none_is_trained_on():
+    one, other = (datamodule(seed=seed, new_shapes=True) for seed in (0, 1))
+    np.testing.assert_array_equal(one.clouds("val").rows, other.clouds("val").rows)
+    np.testing.assert_array_equal(one.clouds("val").rows, datamodule().clouds("val").rows)
+
+
+def test_shapes_of_files_cannot_be_new():
+    with pytest.raises(CorrmatError, match="shapes of modelnet40 cannot be made"):
+        RegistrationDataModule(data="modelnet40", new_shapes=True)
 
 
 def test_too_few_points_are_an_error_that_says_how_many():

@@ -12,20 +12,41 @@ import torch
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from corrmat.data.clouds import CloudSet
-from corrmat.data.pairs import STREAM, Key, PairSettings, Split, generator, make_pairs
+from corrmat.data.pairs import (
+    STREAM,
+    Key,
+    PairSettings,
+    Purpose,
+    Split,
+    generator,
+    make_pairs,
+)
 from corrmat.data.registry import DATASETS, load_clouds
+from corrmat.data.shapes.dataset import sample_shape
 from corrmat.errors import CorrmatError
 from corrmat.types import PairBatch
 
 VALIDATION_SHARE = 0.1
+GENERATED = "shapes", "assemblies"  # data sets of which there are as many shapes as one likes
 _HELD_OUT_STREAM = 3  # random stream that selects the held-out training shapes
 
 
 class PairDataset(Dataset[PairBatch]):
-    """Pairs of a set of clouds. An item is keyed by (epoch, shape) and never changes."""
+    """Pairs of a set of clouds. An item is keyed by (epoch, shape) and never changes.
 
-    def __init__(self, clouds: CloudSet, settings: PairSettings, seed: int, split: Split) -> None:
-        self.clouds, self.settings = clouds, settings
+    Args:
+        clouds: the clean clouds.
+        settings: how pairs are drawn.
+        seed: of the pairs.
+        split: which pairs these are.
+        new_shapes: make a new shape of the cloud's category for every item.
+    """
+
+    def __init__(
+        self, clouds: CloudSet, settings: PairSettings, seed: int, split: Split,
+        new_shapes: bool = False,
+    ) -> None:  # fmt: skip
+        self.clouds, self.settings, self.new_shapes = clouds, settings, new_shapes
         self.seed, self.stream = seed, STREAM[split]
 
     def __len__(self) -> int:
@@ -39,7 +60,15 @@ class PairDataset(Dataset[PairBatch]):
         """Make a batch of pairs (the DataLoader's protocol)."""
         shapes = [shape for _, shape in items]
         keys = [Key(self.seed, self.stream, epoch, shape) for epoch, shape in items]
-        return make_pairs(self.clouds, shapes, keys, self.settings)
+        if not self.new_shapes:
+            return make_pairs(self.clouds, shapes, keys, self.settings)
+        labels = self.clouds.labels[shapes]
+        rows = [
+            sample_shape(self.clouds.names[label], generator(key, Purpose.SHAPE))
+            for label, key in zip(labels, keys, strict=True)
+        ]
+        made = CloudSet(np.stack(rows), labels, self.clouds.names)
+        return make_pairs(made, range(len(rows)), keys, self.settings)
 
 
 class EpochSampler(Sampler[tuple[int, int]]):
@@ -98,6 +127,9 @@ class RegistrationDataModule(L.LightningDataModule):
         num_workers: processes that make pairs; 0 makes them in the training process, at a
             fraction of a millisecond each.
         seed: of the pairs and of the held-out shapes.
+        new_shapes: train on new shapes in every epoch, of the categories of the training shapes:
+            only for "shapes" and "assemblies". No training shape of the data set is then trained
+            on, whatever the seed; those held out are the ones of seed 0.
         pair_settings: fields of `PairSettings`, e.g. num_points=512, keep=0.7.
 
     Raises:
@@ -115,6 +147,7 @@ class RegistrationDataModule(L.LightningDataModule):
         test_shapes: int | None = None,
         num_workers: int = 0,
         seed: int = 0,
+        new_shapes: bool = False,
         **pair_settings: Any,  # noqa: ANN401 (typed by PairSettings, which checks them)
     ) -> None:
         super().__init__()
@@ -123,6 +156,7 @@ class RegistrationDataModule(L.LightningDataModule):
         self.categories = categories
         self.counts = {"train": train_shapes, "test": test_shapes}
         self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed
+        self.new_shapes = new_shapes
         self._resume_state = {"epoch": 0, "batches": 0}
         for key, value, least in (
             ("batch_size", batch_size, 1),
@@ -133,6 +167,8 @@ class RegistrationDataModule(L.LightningDataModule):
         ):
             if value is not None and value < least:
                 raise CorrmatError(f"{key} = {value} is out of range")
+        if new_shapes and not set(data.split("+")) <= set(GENERATED):
+            raise CorrmatError(f"new_shapes: shapes of {data} cannot be made")
         self._clouds: dict[str, CloudSet] = {}
 
     def setup(self, stage: str | None = None) -> None:
@@ -222,8 +258,9 @@ class RegistrationDataModule(L.LightningDataModule):
         self, split: Split, settings: PairSettings, share: tuple[int, int] = (0, 1)
     ) -> DataLoader[PairBatch]:
         """Build the DataLoader of a split; a resumed training continues at its position."""
-        dataset = PairDataset(self.clouds(split), settings, self.seed, split)
         training = split == "train"
+        new_shapes = self.new_shapes and training
+        dataset = PairDataset(self.clouds(split), settings, self.seed, split, new_shapes)
         epoch, batches = self._resume_state.values() if training else (0, 0)
         skip = batches * self.batch_size
         sampler = EpochSampler(len(dataset), self.seed, training, epoch, skip, share)
@@ -257,7 +294,8 @@ class RegistrationDataModule(L.LightningDataModule):
         """Hold out 10 % of the training shapes (at least one), chosen by the seed."""
         if len(clouds) < 2:
             raise CorrmatError("training needs at least 2 shapes, one of them held out")
-        order = generator(Key(self.seed, _HELD_OUT_STREAM, 0, 0)).permutation(len(clouds))
+        seed = 0 if self.new_shapes else self.seed
+        order = generator(Key(seed, _HELD_OUT_STREAM, 0, 0)).permutation(len(clouds))
         held_out = max(1, round(VALIDATION_SHARE * len(clouds)))
         val, train = np.sort(order[:held_out]), np.sort(order[held_out:])
         return {"train": clouds.select(train), "val": clouds.select(val)}

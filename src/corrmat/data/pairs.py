@@ -137,6 +137,7 @@ class Purpose(IntEnum):
     TARGET_OUTLIERS = 4
     STRETCH = 5
     VIEWS = 6
+    SHAPE = 7  # where every epoch has new shapes
 
 
 _NOTHING = np.empty(0, np.float32)

@@ -22,6 +22,7 @@ SIZE = {"train": 4000, "test": 800}
 ASSEMBLIES = {"train": 8000, "test": 200}
 POINTS = 2048
 NAMES = tuple(families.FAMILIES)
+ASSEMBLY = "assembly"  # the one category of assemblies
 SMALL = 200  # up to this many shapes are made on the spot instead of building the cache
 _ASSEMBLY_SEED = 1  # families have none
 
@@ -47,7 +48,7 @@ def load(split: str, count: int | None = None, root: Path | None = None) -> Clou
 
 def load_assemblies(split: str, count: int | None = None, root: Path | None = None) -> CloudSet:
     """Load random assemblies; see `load`. Making them takes two minutes on two cores."""
-    return _load("assemblies", split, count, ASSEMBLIES[split], ("assembly",), make_assembly)
+    return _load("assemblies", split, count, ASSEMBLIES[split], (ASSEMBLY,), make_assembly)
 
 
 def _load(
@@ -84,24 +85,28 @@ def make_shape(task: tuple[str, int]) -> tuple[np.ndarray, int]:
     split, index = task
     label = index % len(NAMES)
     key = np.array([tuple(SIZE).index(split), index], np.uint64)
-    return _sample(families.FAMILIES[NAMES[label]], key), label
+    return sample_shape(NAMES[label], np.random.Generator(np.random.Philox(key=key))), label
 
 
 def make_assembly(task: tuple[str, int]) -> tuple[np.ndarray, int]:
     """Make one random assembly."""
     split, index = task
     key = np.array([_ASSEMBLY_SEED << 32 | tuple(SIZE).index(split), index], np.uint64)
-    return _sample(assembly, key), 0
+    return sample_shape(ASSEMBLY, np.random.Generator(np.random.Philox(key=key))), 0
 
 
-def _sample(
-    make: Callable[[np.random.Generator], list[trimesh.Trimesh]], key: np.ndarray
-) -> np.ndarray:
-    """Sample a shape of random parts, (2048, 6).
+def sample_shape(name: str, rng: np.random.Generator) -> np.ndarray:
+    """Make a shape of random parts and sample it.
 
-    Points are uniform on the surface, centred at their mean, scaled into the unit sphere.
+    Args:
+        name: of a family, or "assembly".
+        rng: of the shape and its points.
+
+    Returns:
+        (2048, 6) float32: points and unit face normals. The points are uniform on the surface,
+        centred at their mean, scaled into the unit sphere.
     """
-    rng = np.random.Generator(np.random.Philox(key=key))
+    make = assembly if name == ASSEMBLY else families.FAMILIES[name]
     mesh = merged(make(rng))
     points, faces = trimesh.sample.sample_surface(mesh, POINTS, seed=rng)[:2]
     points = points - points.mean(0)
