@@ -463,3 +463,20 @@ def test_points_that_are_near_on_one_side_are_coherent_and_scattered_ones_are_no
     same = AlignmentScorer(sphere, sphere).alignment(np.eye(4))
     assert same.coherence == 0  # all are near: there is nothing to explain
     assert same.agreement == pytest.approx(1, abs=1e-6)
+
+
+def test_the_last_refinement_is_the_better_of_two():
+    rng = np.random.default_rng(0)
+    shape = make_shape(("train", 3))[0][:, :3]
+    wins = set()
+    for noise in (0.01, 0.001, 0.01, 0.001):
+        points = rng.permutation(shape) + noise * rng.standard_normal(shape.shape)
+        scorer = AlignmentScorer(points[:500], points[500:1000])
+        start = np.eye(4)
+        start[:3, 3] = 0.05 * rng.standard_normal(3)
+        each = [scorer.refine(start, method) for method in ("GICP", "PLANE_ICP")]
+        scores = [sum(scorer.alignment(result)) for result in each]
+        best = int(np.argmax(scores))
+        wins.add(best)
+        np.testing.assert_array_equal(scorer.refine_best(start, scorer), each[best])
+    assert wins == {0, 1}

@@ -79,7 +79,8 @@ def register(
         model: "corrmat" for the shipped weights; "icp", or where they are installed "ransac",
             "ransac17", "fgr" or "kiss", for the classical pipelines; whatever else `load_model`
             takes; or a network, or a method, of your own.
-        refine: "icp" on up to 20,000 points of each cloud after the model, or "none".
+        refine: "icp" on up to 20,000 points of each cloud after the model, by the better of two
+            methods; or "none".
         seed: of subsampling and of the model's random draws.
 
     Returns:
@@ -109,7 +110,7 @@ def register(
     transform, (agreement, _, support) = transforms[best], measures[best].tolist()
     full = AlignmentScorer(x.points(scale, FULL_POINTS), y.points(scale, FULL_POINTS))
     if refine == "icp":
-        transform = full.refine(transform)
+        transform = full.refine_best(transform, scorer)
     has_matches = len(hypotheses.matches) > 0
     confidence = _calibration().confidence(agreement, support if has_matches else None)
     overlap, rmse = full.overlap_and_rmse(transform)

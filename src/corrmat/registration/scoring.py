@@ -1,11 +1,15 @@
 """Refinement and scoring of a transform by how well it aligns two clouds."""
 
 import functools
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import small_gicp
 from scipy.spatial import KDTree
+
+from corrmat.data.normals import NEIGHBORS
+
+IcpMethod = Literal["GICP", "PLANE_ICP"]
 
 
 class Alignment(NamedTuple):
@@ -42,7 +46,8 @@ class AlignmentScorer:
         """Source, target and the target's KD-tree, for small_gicp."""
         clouds = [small_gicp.PointCloud(points) for points in (self.source, self.target)]
         for cloud in clouds:
-            small_gicp.estimate_normals_covariances(cloud, num_neighbors=min(12, cloud.size()))
+            neighbors = min(NEIGHBORS, cloud.size())
+            small_gicp.estimate_normals_covariances(cloud, num_neighbors=neighbors)
         return clouds[0], clouds[1], small_gicp.KdTree(clouds[1])
 
     @functools.cached_property
@@ -51,19 +56,32 @@ class AlignmentScorer:
         source, target, _ = self._clouds
         return np.asarray(source.normals())[:, :3], np.asarray(target.normals())[:, :3]
 
-    def refine(self, transform: np.ndarray) -> np.ndarray:
-        """Refine a transform (4, 4) by generalised ICP (Segal et al., RSS 2009)."""
+    def refine(self, transform: np.ndarray, method: IcpMethod = "GICP") -> np.ndarray:
+        """Refine a transform (4, 4) by generalised ICP (Segal et al., RSS 2009), or another."""
         source, target, tree = self._clouds
         result = small_gicp.align(
             target,
             source,
             tree,
             transform,
-            registration_type="GICP",
+            registration_type=method,
             max_correspondence_distance=self.max_distance,
             max_iterations=30,
         )
         return np.asarray(result.T_target_source)
+
+    def refine_best(self, transform: np.ndarray, judge: "AlignmentScorer") -> np.ndarray:
+        """Refine a transform (4, 4) by both methods of ICP, and keep the better result.
+
+        Generalised ICP comes from farther away and slides less along walls. Point-to-plane ICP
+        (Chen and Medioni, 1992) is more exact where points are few and noisy.
+
+        Args:
+            transform: of the source onto the target.
+            judge: of the same clouds, perhaps with fewer points: tells which is better.
+        """
+        refined = [self.refine(transform, method) for method in get_args(IcpMethod)]
+        return max(refined, key=lambda result: sum(judge.alignment(result)))
 
     def alignment(self, transform: np.ndarray) -> Alignment:
         """Measure how well a transform (4, 4) puts the clouds on each other."""
