@@ -7,12 +7,13 @@ This tries weights on pairs of training shapes that were held out of the trainin
 and writes results/register/choice.json: the recall at 5 degrees and by ADD-S for each (a, b).
 Three more rows say what limits it: the best candidate of every pair, which no choice can exceed;
 the true transform after ICP, which a symmetric shape slides away from; and the choice where that
-joins the candidates.
+joins the candidates. The last rows compare how the chosen one is refined once more.
 """
 
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple, get_args
 
 import numpy as np
 from rich.progress import track
@@ -27,6 +28,7 @@ from corrmat.registration.register import (
     prepare_clouds,
     to_original_units,
 )
+from corrmat.registration.scoring import IcpMethod
 from corrmat.registration.shipping import held_out_pairs
 from corrmat.revision import commit
 from corrmat.types import PairBatch
@@ -44,16 +46,21 @@ WEIGHTS = (
     (1.5, 0.4),
 )
 IN_USE = COHERENCE_WEIGHT, SUPPORT_WEIGHT
+METHODS: tuple[IcpMethod, ...] = get_args(IcpMethod)
+REFINED = *METHODS, "the better of both"
 PAIRS = {"real": 400, "views": 300, "clean": 100}
 _SEED = 5  # of pairs that nothing else uses
 
 
-def candidates(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> np.ndarray:
-    """Compute agreement, coherence, support, degrees and ADD-S of a pair's candidates.
+class PairTables(NamedTuple):
+    """What the candidates of a pair are worth; the last of them is the true transform."""
 
-    Returns:
-        (T + 1, 5): the last row is the true transform, refined as the candidates are.
-    """
+    candidates: np.ndarray  # (T + 1, 5) agreement, coherence, support, degrees and ADD-S
+    refined: np.ndarray  # (3, 2) degrees and ADD-S of the chosen one, refined as in `REFINED`
+
+
+def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> PairTables:
+    """Refine and measure the candidates of a pair, and the true transform in the same way."""
     source, target = (c[index].double().numpy() for c in (pairs.source, pairs.target))
     (x, y), scale, subsamples, scorer = prepare_clouds(source, target, 0)
     hypotheses = generate(*subsamples, 0)
@@ -63,21 +70,34 @@ def candidates(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> np.
     truth[:3, 3] *= scale
     hypotheses = hypotheses._replace(transforms=np.stack([*hypotheses.transforms, truth]))
     transforms, measures = measure_candidates(hypotheses, subsamples, scorer)
-    in_units = [to_original_units(t, scale, x.centre, y.centre) for t in transforms]
-    return np.hstack([measures, [benchmark.errors(pairs, index, t) for t in in_units]])
+    chosen = transforms[int(np.argmax(measures[:-1] @ [1, *IN_USE]))]
+    refined = [scorer.refine(chosen, method) for method in METHODS]
+    refined.append(scorer.refine_best(chosen, scorer))
+
+    def errors_of(transforms: Sequence[np.ndarray]) -> list[tuple[float, float]]:
+        in_units = [to_original_units(t, scale, x.centre, y.centre) for t in transforms]
+        return [benchmark.errors(pairs, index, t) for t in in_units]
+
+    return PairTables(
+        np.hstack([measures, errors_of(list(transforms))]), np.array(errors_of(refined))
+    )
 
 
 def recalls(tables: Sequence[np.ndarray], weights: tuple[float, float] | None) -> dict[str, float]:
     """Compute the recall of choosing by weights; of the best candidate of each pair if None."""
-    degrees, adds = [], []
+    chosen = []
     for table in tables:
-        angle, distance = table[:, 3:].T
         best = slice(None) if weights is None else [np.argmax(table[:, :3] @ [1, *weights])]
-        degrees.append(angle[best].min())
-        adds.append(distance[best].min())
+        chosen.append(table[best, 3:].min(0))
+    return shares(chosen)
+
+
+def shares(errors: Sequence[np.ndarray]) -> dict[str, float]:
+    """Compute the recalls of pairs from their degrees and ADD-S (2,)."""
+    degrees, adds = np.array(errors).T
     return {
-        "recall_5deg": round(float(np.mean(np.array(degrees) < RECALL_DEG)), 4),
-        "recall_adds": round(float(np.mean(np.array(adds) < ADDS_THRESHOLD)), 4),
+        "recall_5deg": round(float(np.mean(degrees < RECALL_DEG)), 4),
+        "recall_adds": round(float(np.mean(adds < ADDS_THRESHOLD)), 4),
     }
 
 
@@ -87,15 +107,21 @@ def main() -> None:
     content: dict[str, object] = {"commit": commit(), "points": 512}
     for protocol, count in PAIRS.items():
         pairs = held_out_pairs(protocol, count, _SEED)
-        tables = [
-            candidates(pairs, index, generate)
+        measured = [
+            tables_of(pairs, index, generate)
             for index in track(range(len(pairs)), protocol, transient=True)
         ]
+        tables = [table.candidates for table in measured]
         without_truth = [table[:-1] for table in tables]
         tried = {f"{a}, {b}": recalls(without_truth, (a, b)) for a, b in WEIGHTS}
         tried["best candidate"] = recalls(without_truth, None)
         tried["the truth, after ICP"] = recalls([table[-1:] for table in tables], None)
-        tried[f"{IN_USE[0]}, {IN_USE[1]}, the truth among the candidates"] = recalls(tables, IN_USE)
+        in_use = f"{IN_USE[0]}, {IN_USE[1]}"
+        tried[f"{in_use}, the truth among the candidates"] = recalls(tables, IN_USE)
+        for row, name in enumerate(REFINED):
+            tried[f"{in_use}, refined once more by {name}"] = shares(
+                [table.refined[row] for table in measured]
+            )
         count = float(np.mean([len(table) for table in without_truth]))
         content[protocol] = {"pairs": len(pairs), "candidates": count, "weights": tried}
         print(protocol, json.dumps(tried, indent=1), flush=True)
