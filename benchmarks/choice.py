@@ -37,13 +37,14 @@ from corrmat.weights import load_model
 PATH = Path(__file__).resolve().parents[1] / "results" / "register" / "choice.json"
 WEIGHTS = (
     (0.0, 0.0),
-    (0.0, 0.2),
-    (1.0, 0.0),
+    (0.0, 0.4),
     (1.0, 0.2),
+    (1.0, 0.4),
     (1.5, 0.0),
     (1.5, 0.2),
-    (2.0, 0.2),
     (1.5, 0.4),
+    (1.5, 0.6),
+    (2.0, 0.4),
 )
 IN_USE = COHERENCE_WEIGHT, SUPPORT_WEIGHT
 METHODS: tuple[IcpMethod, ...] = get_args(IcpMethod)

@@ -4,6 +4,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from conftest import random_rotation
+from torch import nn
 
 from corrmat.data.pairs import Key, PairSettings, make_pairs
 from corrmat.data.shapes.dataset import load
@@ -76,6 +77,22 @@ def test_logits_do_not_change_with_pose_units_and_signs_and_the_motion_follows(n
     grown = [torch.cat([1000 * c[..., :3], c[..., 3:]], -1) for c in (source, target)]
     larger = network(*grown)
     torch.testing.assert_close(larger.correspondence.logits(), prediction.correspondence.logits())
+
+
+def test_anchors_are_few_in_training_and_with_all_of_them_the_order_of_points_is_free(generator):
+    torch.manual_seed(0)
+    network = InvariantNetwork(16, 2, 1, anchors=8, test_anchors=60, neighbors=4).double()
+    for parameter in network.parameters():  # a new layer of attention changes nothing
+        nn.init.normal_(parameter, std=0.3)
+    assert [len(network.train(mode).anchors_of(50)) for mode in (True, False)] == [8, 50]
+    source, target = pair(generator)
+    order = torch.randperm(60, generator=generator)
+    logits = network(source, target).correspondence.logits()
+    permuted = network(source[:, order], target).correspondence.logits()
+    torch.testing.assert_close(permuted[:, : len(order)], logits[:, order])
+    network.test_anchors = 8
+    few, permuted = (network(s, target).correspondence for s in (source, source[:, order]))
+    assert (permuted.logits()[:, : len(order)] - few.logits()[:, order]).abs().max() > 1e-3
 
 
 def test_the_network_learns_at_its_neighbourhoods_and_at_its_end(network, generator):

@@ -26,7 +26,8 @@ class InvariantNetwork(nn.Module):
         width: feature dimension d.
         heads: attention heads.
         layers: attention layers.
-        anchors: points of a cloud that each of its points attends to.
+        anchors: points of a cloud that each of its points attends to in training.
+        test_anchors: the same when it registers. More make the means of attention less noisy.
         neighbors: points sampled of each neighbourhood.
         shares: sizes of the neighbourhoods, as shares of the cloud, so that they do not depend
             on the sampling density.
@@ -38,13 +39,15 @@ class InvariantNetwork(nn.Module):
         heads: int = 4,
         layers: int = 2,
         anchors: int = 64,
+        test_anchors: int = 256,
         neighbors: int = 8,
         shares: tuple[float, ...] = (0.05, 0.1, 0.2),
     ) -> None:
         super().__init__()
-        require_positive(anchors=anchors, neighbors=neighbors)
+        require_positive(anchors=anchors, test_anchors=test_anchors, neighbors=neighbors)
         self.min_points = 3
-        self.anchors, self.neighbors, self.shares = anchors, neighbors, shares
+        self.anchors, self.test_anchors = anchors, test_anchors
+        self.neighbors, self.shares = neighbors, shares
         self.embed = NeighborhoodEmbedding(width, len(shares))
         self.layers = nn.ModuleList(Layer(width, heads) for _ in range(layers))
         self.norm = nn.LayerNorm(width)
@@ -58,8 +61,7 @@ class InvariantNetwork(nn.Module):
         scale = 2 / (radius(x) + radius(y))
         local_x = self.local_pair_features(source, scale)
         local_y = self.local_pair_features(target, scale)
-        anchors_x = evenly_spaced_indices(x.shape[1], self.anchors)
-        anchors_y = evenly_spaced_indices(y.shape[1], self.anchors)
+        anchors_x, anchors_y = self.anchors_of(x.shape[1]), self.anchors_of(y.shape[1])
         pairs_x = pair_features(source, anchors_x, scale)
         pairs_y = pair_features(target, anchors_y, scale)
         f_x, f_y = self.embed(local_x), self.embed(local_y)
@@ -74,6 +76,11 @@ class InvariantNetwork(nn.Module):
         correspondence = self.matching_head(self.norm(f_x), self.norm(f_y))
         y_hat = correspondence.soft_target(y)
         return Prediction(*procrustes(x, y_hat, correspondence.weight()), correspondence)
+
+    def anchors_of(self, size: int) -> Tensor:
+        """Return the rows of the anchors of a cloud of `size` points."""
+        count = self.anchors if self.training else self.test_anchors
+        return evenly_spaced_indices(size, min(size, count))
 
     @torch.no_grad()
     def local_pair_features(self, cloud: Tensor, scale: Tensor) -> Tensor:

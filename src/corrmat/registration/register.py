@@ -27,7 +27,7 @@ MODEL_POINTS = 1024  # points of either cloud for the model
 SELECTION_POINTS = 2048  # to select among its hypotheses
 FULL_POINTS = 20_000  # to refine the selected one
 # A candidate scores agreement + these times coherence and support; see benchmarks/choice.py.
-COHERENCE_WEIGHT, SUPPORT_WEIGHT = 1.0, 0.2
+COHERENCE_WEIGHT, SUPPORT_WEIGHT = 1.5, 0.4
 MEDIAN = 0.6  # median distance from the centroid after scaling: a radius of about one
 MAX_NORMAL = 1.01  # longest given normal
 FAR = 30.0  # median distances from the middle: a point beyond is a stray one and left out
