@@ -1,0 +1,63 @@
+"""Recall of every network that `corrmat register` shipped, against the pairs it was trained on.
+
+    python benchmarks/training_recall.py        minutes
+
+git keeps the weights of earlier runs of `make weights`. All are tested on the same held-out pairs,
+with the candidates, choice and refinement of today; `validation` in results/register/training.json
+is written anew.
+"""
+
+import json
+import subprocess
+import tempfile
+from pathlib import Path
+
+import safetensors
+
+from corrmat.registration import benchmark
+from corrmat.registration.shipping import CALIBRATION_PAIRS, held_out_pairs
+
+ROOT = Path(__file__).resolve().parents[1]
+WEIGHTS = "src/corrmat/shipped/corrmat.safetensors"
+TRAINING = ROOT / "results" / "register" / "training.json"
+PROTOCOLS: tuple[benchmark.Protocol, ...] = ("real", "views", "clean")
+POINTS = 512
+
+
+def git(*words: str) -> bytes:
+    """Run git in the repository and return what it prints."""
+    return subprocess.run(["git", *words], cwd=ROOT, check=True, capture_output=True).stdout
+
+
+def extract_weights(folder: Path) -> dict[int, Path]:
+    """Write the newest weights of each number of training pairs into a folder."""
+    found: dict[int, Path] = {}
+    for number, commit in enumerate(git("log", "--format=%H", "--", WEIGHTS).decode().split()):
+        path = folder / f"{number}.safetensors"
+        path.write_bytes(git("show", f"{commit}:{WEIGHTS}"))
+        with safetensors.safe_open(path, framework="pt") as file:
+            pairs = (file.metadata() or {}).get("pairs")
+        if pairs is None:
+            break  # weights of before did not say
+        found.setdefault(int(pairs), path)
+    return found
+
+
+def main() -> None:
+    """Test all networks and write their recalls."""
+    runs = json.loads(TRAINING.read_text())
+    tests = {p: held_out_pairs(p, CALIBRATION_PAIRS[POINTS], 0, POINTS) for p in PROTOCOLS}
+    with tempfile.TemporaryDirectory() as folder:
+        weights = extract_weights(Path(folder))
+        for run in runs:
+            model = str(weights[run["pairs"]])
+            run["validation"] = {
+                protocol: benchmark.compare(pairs, [model])[model].recall_5deg
+                for protocol, pairs in tests.items()
+            }
+            print(f"{run['pairs']:,} pairs", run["validation"], flush=True)
+    TRAINING.write_text(json.dumps(runs, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
