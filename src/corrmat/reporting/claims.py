@@ -197,7 +197,8 @@ def flat_over_misalignment(evidence: Evidence) -> Claim:
     return Claim(
         "1.4: DCP_corr's error hardly grows with the misalignment (table 1)",
         "0.005 to 0.010 deg: 2 times",
-        f"median, last band to first: {_text(growth)} times",
+        f"median {first_band.median_deg:.2g} deg in the first band, {last_band.median_deg:.2g} in "
+        f"the last: {_text(growth)} times",
         evidence.where,
         verdict,
     )
