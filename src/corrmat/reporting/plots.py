@@ -13,7 +13,7 @@ from corrmat.reporting.snapshots import PairSnapshot, Stage, stages, thin
 Plot = dict[str, object]
 """A plotly figure: `data` and `layout`."""
 QUANTILES = np.linspace(0, 1, 51)
-_MAX_POINTS, _MAX_LINES = 60, 30  # drawn of a cloud, of the matches: the page stays small
+_MAX_POINTS, _MAX_LINES = 60, 25  # drawn of a cloud, of the matches: the page stays small
 
 
 def curves_plot(record: Record) -> Plot:
@@ -127,7 +127,7 @@ def _match_trace(stage: Stage, which: np.ndarray, name: str, colour: str) -> Plo
     for i in chosen:
         for axis in range(3):
             start, end = stage.source[i, axis], stage.target[stage.matched[i], axis]
-            ends[axis] += [round(float(start), 3), round(float(end), 3), None]
+            ends[axis] += [round(float(start), 2), round(float(end), 2), None]
     common = {"type": "scatter3d", "mode": "lines", "hoverinfo": "skip", "line": {"color": colour}}
     return common | {"x": ends[0], "y": ends[1], "z": ends[2], "name": name}
 
