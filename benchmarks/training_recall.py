@@ -15,12 +15,15 @@ from pathlib import Path
 import safetensors
 
 from corrmat.registration import benchmark
-from corrmat.registration.shipping import CALIBRATION_PAIRS, held_out_pairs
+from corrmat.registration.shipping import (
+    CALIBRATION_PAIRS,
+    CALIBRATION_PROTOCOLS,
+    held_out_pairs,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 WEIGHTS = "src/corrmat/shipped/corrmat.safetensors"
 TRAINING = ROOT / "results" / "register" / "training.json"
-PROTOCOLS: tuple[benchmark.Protocol, ...] = ("real", "views", "clean")
 POINTS = 512
 
 
@@ -46,7 +49,10 @@ def extract_weights(folder: Path) -> dict[int, Path]:
 def main() -> None:
     """Test all networks and write their recalls."""
     runs = json.loads(TRAINING.read_text())
-    tests = {p: held_out_pairs(p, CALIBRATION_PAIRS[POINTS], 0, POINTS) for p in PROTOCOLS}
+    tests = {
+        protocol: held_out_pairs(protocol, CALIBRATION_PAIRS[POINTS], 0, POINTS)
+        for protocol in CALIBRATION_PROTOCOLS
+    }
     with tempfile.TemporaryDirectory() as folder:
         weights = extract_weights(Path(folder))
         for run in runs:

@@ -21,7 +21,7 @@ from corrmat.types import PairBatch
 
 CALIBRATION_PAIRS = {512: 200, 1024: 100}  # of a protocol, by points of a cloud
 _TRAINING = Path("register", "training.json")  # below results/
-_PROTOCOLS: tuple[benchmark.Protocol, ...] = ("real", "views", "clean")
+CALIBRATION_PROTOCOLS: tuple[benchmark.Protocol, ...] = ("real", "views", "clean")
 
 
 def ship(checkpoint: Path, facts: Mapping[str, Any], results: Path) -> None:
@@ -90,7 +90,7 @@ def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:
         protocol's pairs of 512 points that are within 5 degrees.
     """
     scores, aligned, recalls = [], [], {}
-    for protocol, points in itertools.product(_PROTOCOLS, CALIBRATION_PAIRS):
+    for protocol, points in itertools.product(CALIBRATION_PROTOCOLS, CALIBRATION_PAIRS):
         pairs = held_out_pairs(protocol, CALIBRATION_PAIRS[points], seed=0, points=points)
         result = benchmark.compare(pairs, [model])[model]
         recalls.setdefault(protocol, result.recall_5deg)

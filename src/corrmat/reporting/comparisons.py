@@ -200,7 +200,7 @@ def draw_training(results: Path) -> None:
             recall.plot(ends, slope * np.log2(ends) + intercept, ":", color=colour)
     loss.set(title="training loss", xlabel="pairs seen")
     recall.set(title="within 5 degrees, held out, %", xlabel="pairs seen", xscale="log")
-    recall.set_xticks([*(run["pairs"] for run in runs), 2 * runs[-1]["pairs"]])
+    recall.set_xticks([runs[0]["pairs"], runs[-1]["pairs"], 2 * runs[-1]["pairs"]])
     recall.xaxis.set_minor_locator(NullLocator())
     figure.legend(*recall.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     for axes in (loss, recall):
