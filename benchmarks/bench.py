@@ -46,6 +46,7 @@ from corrmat.losses import chamfer_loss, correspondence_loss  # noqa: E402
 from corrmat.methods import METHODS  # noqa: E402
 from corrmat.networks.dcp import DCPNetwork  # noqa: E402
 from corrmat.networks.pcrnet import PCRNetCorrNetwork  # noqa: E402
+from corrmat.networks.ppf import signless_pair_features  # noqa: E402
 from corrmat.networks.rpmnet import RPMNetwork  # noqa: E402
 from corrmat.ops import streaming  # noqa: E402
 from corrmat.ops.correspondence import SinkhornCorrespondence, SoftCorrespondence  # noqa: E402
@@ -120,7 +121,7 @@ def main() -> None:
     add("corrmat.register, two clouds of 1,024 points", in_a_process(registered_pair))
     add("corrmat register, the example, from a cold start", in_a_process(cold_start))
     for name in TWINS:
-        add(f"{name}, value and gradient", in_a_process(against_twin, name))
+        add(name, in_a_process(against_twin, name))
     for n in (512, 2048, 8192):
         add(f"loss and pose, d=512, N={n}, streamed", in_a_process(against_dense, n))
     growth: dict[str, list[Row]] = {what: [] for what in GROWTH}
@@ -355,6 +356,12 @@ def _procrustes() -> tuple[Callable[[], object], ...]:
     return tuple(_pulled(work, x, y, w) for work in (procrustes, twins.procrustes_loop))
 
 
+def _pair_features() -> tuple[Callable[[], object], ...]:
+    offset, n, m = torch.nn.functional.normalize(torch.randn(3, 700, 256, 3), dim=-1)
+    features = (signless_pair_features, twins.pair_features_as_written)
+    return tuple(lambda work=work: work(offset, n[:, :1], m[:1]) for work in features)
+
+
 def _ball_query() -> tuple[Callable[[], object], ...]:
     points = torch.rand(4, 1024, 3)
     queries = (within_radius, twins.ball_query_by_sorting)
@@ -391,11 +398,12 @@ def _cross_entropy() -> tuple[Callable[[], object], ...]:
 
 
 TWINS: dict[str, Callable[[], tuple[Callable[[], object], ...]]] = {
-    "Procrustes, 16 pairs of 512": _procrustes,
+    "Procrustes, 16 pairs of 512, value and gradient": _procrustes,
+    "pair features, 700 points to 256 anchors": _pair_features,
     "neighbours within a radius, 4 clouds of 1024": _ball_query,
-    "Chamfer distance, 8 pairs of 1024": _chamfer,
-    "Sinkhorn, 2 pairs of 1024": _sinkhorn,
-    "cross-entropy, 4 pairs of 1024, d=512": _cross_entropy,
+    "Chamfer distance, 8 pairs of 1024, value and gradient": _chamfer,
+    "Sinkhorn, 2 pairs of 1024, value and gradient": _sinkhorn,
+    "cross-entropy, 4 pairs of 1024, d=512, value and gradient": _cross_entropy,
 }
 
 

@@ -3,6 +3,7 @@
 import pytest
 import torch
 import torch.nn.functional as F
+import twins
 from conftest import random_rotation
 from torch import nn
 
@@ -10,7 +11,12 @@ from corrmat.data.pairs import Key, PairSettings, make_pairs
 from corrmat.data.shapes.dataset import load
 from corrmat.losses import mutual_loss, mutual_matches
 from corrmat.methods import InvariantCorr
-from corrmat.networks.invariant import InvariantNetwork, evenly_spaced_indices, radius
+from corrmat.networks.invariant import (
+    InvariantNetwork,
+    evenly_spaced_indices,
+    pair_features,
+    radius,
+)
 from corrmat.networks.ppf import SIGNLESS, signless_pair_features
 from corrmat.ops import streaming
 from corrmat.ops.correspondence import MatchabilityCorrespondence
@@ -43,6 +49,21 @@ def test_pair_features_tell_a_pair_from_its_mirror_image_and_a_bend_from_a_step(
     left, right = F.normalize(torch.tensor([[-0.5, 1, 0], [0.5, 1, 0]]), dim=-1)
     bend, step = signless_pair_features(x, left, right), signless_pair_features(x, right, right)
     assert bend[-2] < 0 < step[-2]
+
+
+def test_pair_features_are_those_of_the_formula(generator):
+    offset, n, m = oriented(generator, 60)
+    expected = twins.pair_features_as_written(offset, n, m)
+    torch.testing.assert_close(signless_pair_features(offset, n, m), expected)
+    cloud = torch.cat([offset[None], n[None]], -1)
+    anchors, scale = torch.tensor([3, 50, 20]), torch.tensor([0.7]).double()
+    neighbors = torch.randint(60, (1, 60, 2, 4), generator=generator)
+    for index in (anchors, neighbors):
+        other = cloud[0, index[0] if index.ndim > 1 else index.expand(60, 3)]
+        centre = cloud[0].view(60, *[1] * (other.ndim - 2), 6)
+        offset = 0.7 * (other[..., :3] - centre[..., :3])
+        expected = twins.pair_features_as_written(offset, centre[..., 3:], other[..., 3:])
+        torch.testing.assert_close(pair_features(cloud, index, scale), expected[None])
 
 
 def test_coinciding_points_have_finite_features():

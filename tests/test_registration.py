@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import shared
+from conftest import random_rotation, shared
 from PIL import Image
 
 import corrmat
@@ -21,6 +21,7 @@ from corrmat.data.shapes.dataset import make_shape
 from corrmat.errors import CorrmatError
 from corrmat.registration import example
 from corrmat.registration import register as registration
+from corrmat.registration.hypotheses import rough_agreement
 from corrmat.registration.scoring import AlignmentScorer
 from corrmat.registration.view import registration_page
 from corrmat.types import Prediction
@@ -450,6 +451,19 @@ def test_only_the_shipped_weights_have_a_calibrated_confidence(pair):
         registration.to_text(corrmat.register(source, target, model=m)) for m in ("corrmat", "icp")
     ]
     assert ["fitted to the shipped weights" in text for text in texts] == [False, True]
+
+
+def test_rough_agreement_is_that_of_all_distances(generator):
+    rotation = random_rotation(20, generator)
+    translation, (source, target) = torch.zeros(20, 3), torch.randn(2, 40, 6, generator=generator)
+    found = rough_agreement(rotation, translation, source, target)
+    moved = source[:, :3].double() @ rotation.mT
+    distance, nearest = torch.cdist(moved, target[:, :3].double()).min(-1)
+    normals = source[:, 3:].double() @ rotation.mT
+    parallel = (normals * target[nearest, 3:]).sum(-1).abs()
+    expected = (parallel * (1 - (distance / 0.3) ** 2).clamp_min(0)).mean(1)
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
+    assert (distance.amax(1) > 0.3).all()  # some points have none near
 
 
 def test_points_that_are_near_on_one_side_are_coherent_and_scattered_ones_are_not():

@@ -185,6 +185,19 @@ def released_rpmnet(
     return rotation, translation, matrices
 
 
+def pair_features_as_written(offset: Tensor, n: Tensor, m: Tensor) -> Tensor:
+    """Signless pair features by their formula, coordinates last: (..., 13)."""
+    distance = offset.norm(dim=-1).clamp_min(1e-6)
+    d = offset / distance.unsqueeze(-1)
+    a, b, c = (n * d).sum(-1), (m * d).sum(-1), (n * m).sum(-1)
+    triple = (torch.linalg.cross(*torch.broadcast_tensors(n, m)) * d).sum(-1)
+    bumps = [
+        torch.exp(-(((distance / centre).log() / 0.45) ** 2))
+        for centre in (0.05, 0.1, 0.17, 0.27, 0.42, 0.65, 1.0, 1.6)
+    ]
+    return torch.stack([*bumps, a.abs(), b.abs(), c.abs(), a * b * c, triple * c], -1)
+
+
 def square_distance(x: Tensor, y: Tensor) -> Tensor:
     """|x_i - y_j|^2 of (B, N, d) and (B, M, d), by products: no (B, N, M, d) array."""
     return x.square().sum(2, keepdim=True) - 2 * x @ y.mT + y.square().sum(2).unsqueeze(1)

@@ -112,11 +112,16 @@ def pair_features(cloud: Tensor, index: Tensor, scale: Tensor) -> Tensor:
         index: (B, N, ...) for each point, or (A,) for all points.
         scale: (B,) factor of all lengths.
     """
-    other = cloud[:, index].unsqueeze(1) if index.ndim == 1 else gather_points(cloud, index)
-    centre = cloud[(slice(None), slice(None), *[None] * (other.ndim - 3))]
-    factor = scale[(slice(None), *[None] * (other.ndim - 1))]
-    offset = (other[..., :3] - centre[..., :3]) * factor
-    return signless_pair_features(offset, centre[..., 3:6], other[..., 3:6])
+    points = cloud.movedim(-1, 0).contiguous()  # sums over a last dimension of three are slow
+    if index.ndim == 1:
+        other = points[..., index].unsqueeze(2)
+    else:
+        other = gather_points(cloud, index).movedim(-1, 0)
+    centre = points[(..., *[None] * (other.ndim - 3))]
+    factor = scale[(slice(None), *[None] * (other.ndim - 2))]
+    offset = (other[:3] - centre[:3]) * factor
+    vectors = (vector.movedim(0, -1) for vector in (offset, centre[3:6], other[3:6]))
+    return signless_pair_features(*vectors)
 
 
 class NeighborhoodEmbedding(nn.Module):
@@ -135,7 +140,7 @@ class NeighborhoodEmbedding(nn.Module):
     def forward(self, pair_features: Tensor) -> Tensor:
         """Map pair features (B, N, sizes, neighbors, F) to features (B, N, width)."""
         edges = self.edge(pair_features)
-        return self.point(torch.cat([edges.max(3).values, edges.mean(3)], -1).flatten(2))
+        return self.point(torch.cat([edges.amax(3), edges.mean(3)], -1).flatten(2))
 
 
 class Layer(nn.Module):
@@ -187,11 +192,12 @@ class PairAttention(nn.Module):
     def forward(self, x: Tensor, anchors: Tensor, pairs: Tensor) -> Tensor:
         """Let x (B, N, d) attend to anchors (B, A, d), given pair features (B, N, A, F)."""
         width = self.heads * self.size
-        q, p = self.query(x).split([width, self.heads * SIGNLESS], -1)
+        scaled = self.query(x) * self.size**-0.5
+        q, p = scaled.split([width, self.heads * SIGNLESS], -1)
         k, v = self.key_value(anchors).split(width, -1)
         q, k, v = (t.unflatten(-1, (self.heads, -1)).transpose(1, 2) for t in (q, k, v))
         geometry = p.unflatten(-1, (self.heads, -1)) @ pairs.mT  # (B, N, H, A)
-        attention = ((q @ k.mT + geometry.transpose(1, 2)) * self.size**-0.5).softmax(-1)
+        attention = (q @ k.mT).add_(geometry.transpose(1, 2)).softmax(-1)
         values = (attention @ v).transpose(1, 2).flatten(2)
         relations = (attention.transpose(1, 2) @ pairs).flatten(2)
         return self.out(torch.cat([values, relations], -1))

@@ -74,6 +74,7 @@ def _angle_rad(a: Tensor, b: Tensor) -> Tensor:
 
 
 SIGNLESS = 13  # features of `signless_pair_features`
+_BUMP_WIDTH = 0.45
 _BUMP_CENTRES = (0.05, 0.1, 0.17, 0.27, 0.42, 0.65, 1.0, 1.6)
 
 
@@ -94,12 +95,24 @@ def signless_pair_features(offset: Tensor, normal: Tensor, neighbor_normal: Tens
         (..., 13), each of order one.
     """
     x, n, m = _coordinates_first(offset, normal, neighbor_normal)
-    distance = x.square().sum(0).sqrt().clamp_min(1e-6)
+    distance = _dot(x, x).sqrt_().clamp_min_(1e-6)
     d = x / distance
-    a, b, c = (n * d).sum(0), (m * d).sum(0), (n * m).sum(0)
-    triple = (torch.linalg.cross(*torch.broadcast_tensors(n, m), dim=0) * d).sum(0)
-    log_distance = distance.log()
-    bumps = [
-        torch.exp(-((log_distance - math.log(centre)) / 0.45).square()) for centre in _BUMP_CENTRES
-    ]
-    return torch.stack([*bumps, a.abs(), b.abs(), c.abs(), a * b * c, triple * c], -1)
+    a, b, c = _dot(n, d), _dot(m, d), _dot(n, m)
+    # Every feature is written to its place in one block: several times as fast as a stack.
+    features = distance.new_empty(SIGNLESS, *distance.shape)
+    log_distance = distance.log_().div_(_BUMP_WIDTH)
+    for bump, centre in zip(features, _BUMP_CENTRES, strict=False):
+        torch.sub(log_distance, math.log(centre) / _BUMP_WIDTH, out=bump).square_().neg_().exp_()
+    for feature, value in zip(features[-5:], (a, b, c), strict=False):
+        torch.abs(value, out=feature)
+    torch.mul(a.mul_(b), c, out=features[-2])
+    triple = torch.zeros_like(c)
+    for k in range(3):
+        triple.addcmul_(d[k], (n[k - 2] * m[k - 1]).addcmul_(n[k - 1], m[k - 2], value=-1))
+    torch.mul(triple, c, out=features[-1])
+    return features.movedim(0, -1)
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    """Compute dot products of vectors, coordinates first."""
+    return torch.addcmul(a[0] * b[0], a[1], b[1]).addcmul_(a[2], b[2])

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.spatial import KDTree
 from torch import nn
 
 from corrmat.baselines import (
@@ -153,10 +154,13 @@ def rough_agreement(
     rotation, translation = rotation.to(source), translation.to(source)
     moved = source[:, :3] @ rotation.mT + translation.unsqueeze(1)
     normals = source[:, 3:6] @ rotation.mT
-    distance, nearest = torch.cdist(moved.flatten(0, 1), target[:, :3]).min(1)
-    parallel = (normals.flatten(0, 1) * target[nearest, 3:6]).sum(1).abs()
-    closeness = 1 - (distance / _ROUGH_DISTANCE).square()
-    return (parallel * closeness.clamp_min(0)).view(moved.shape[:2]).mean(1)
+    # No point within the distance: the distance is infinite, and the index one past the last.
+    tree = KDTree(target[:, :3].numpy())
+    distance, nearest = tree.query(moved.numpy(), distance_upper_bound=_ROUGH_DISTANCE)
+    closeness = np.clip(1 - (distance / _ROUGH_DISTANCE) ** 2, 0, None)
+    nearest_normals = target[np.minimum(nearest, len(target) - 1), 3:6]
+    parallel = (normals * nearest_normals).sum(-1).abs()
+    return (parallel * torch.from_numpy(closeness)).mean(1)
 
 
 def _matrix(rotation: torch.Tensor, translation: torch.Tensor) -> np.ndarray:
