@@ -13,7 +13,7 @@ from corrmat.reporting.snapshots import PairSnapshot, Stage, stages, thin
 Plot = dict[str, object]
 """A plotly figure: `data` and `layout`."""
 QUANTILES = np.linspace(0, 1, 51)
-_MAX_POINTS, _MAX_LINES = 60, 25  # drawn of a cloud, of the matches: the page stays small
+_MAX_POINTS, _MAX_LINES = 200, 60  # drawn of a cloud, of the matches: the page stays small
 
 
 def curves_plot(record: Record) -> Plot:
@@ -92,8 +92,8 @@ def snapshot_plot(snapshot: PairSnapshot) -> Plot:
     layout = {
         "scene": {"aspectmode": "data", "xaxis": hidden, "yaxis": hidden, "zaxis": hidden},
         "sliders": [{"active": len(scenes) - 1, "steps": steps}],
-        "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
-        "legend": {"orientation": "h"},
+        "margin": {"l": 40, "r": 40, "t": 0, "b": 30},  # room for the slider's labels
+        "legend": {"orientation": "h", "y": 1},  # above: the slider is below
     }
     return {"data": data, "layout": layout}
 
@@ -127,7 +127,7 @@ def _match_trace(stage: Stage, which: np.ndarray, name: str, colour: str) -> Plo
     for i in chosen:
         for axis in range(3):
             start, end = stage.source[i, axis], stage.target[stage.matched[i], axis]
-            ends[axis] += [round(float(start), 2), round(float(end), 2), None]
+            ends[axis] += [round(float(start), 3), round(float(end), 3), None]
     common = {"type": "scatter3d", "mode": "lines", "hoverinfo": "skip", "line": {"color": colour}}
     return common | {"x": ends[0], "y": ends[1], "z": ends[2], "name": name}
 
