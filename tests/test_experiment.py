@@ -306,6 +306,22 @@ def test_other_settings_do_not_go_on_from_an_old_checkpoint(tmp_path, capsys):
     assert (tmp_path / "DCP.previous" / "last.ckpt").read_bytes() == old  # nothing is lost
 
 
+@pytest.mark.parametrize(("lacking", "same"), [("new_shapes", True), ("num_points", False)])
+def test_an_option_that_a_run_did_not_know_had_its_default(lacking, same, tmp_path, capsys):
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit):  # noqa: PT012
+        press_ctrl_c("training_step", 5, patch)
+        train(load("1.1").arms["DCP"], tmp_path / "DCP")
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    capsys.readouterr()
+    settings = tmp_path / "DCP" / "settings.yaml"
+    lines = settings.read_text().splitlines(keepends=True)
+    older = "".join(line for line in lines if not line.strip().startswith(f"{lacking}:"))
+    assert older != settings.read_text()
+    settings.write_text(older)
+    train(load("1.1").arms["DCP"], tmp_path / "DCP")
+    assert ("continuing from" in capsys.readouterr().out) == same
+
+
 def test_the_commit_is_read_before_training_and_not_after(tmp_path, monkeypatch):
     """Hours later the files may be another commit's, but the code in memory is not."""
     runs = tmp_path / "runs"

@@ -303,6 +303,11 @@ def _arm_settings(
     )  # fmt: skip
 
 
+def default_settings(method: str) -> Settings:
+    """Return the settings of an arm of which a recipe says nothing but the method."""
+    return _arm_settings(method, {}, {}, {}, Path("defaults")).as_plain()
+
+
 def _check_baselines(names: Sequence[str], path: Path) -> tuple[str, ...]:
     """Check the names of baselines."""
     available = (*BASELINES, UNTRAINED)

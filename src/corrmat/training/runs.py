@@ -13,7 +13,7 @@ import yaml
 
 from corrmat.files import replace_text
 from corrmat.training.preflight import Arm
-from corrmat.training.recipe import Recipe, Settings
+from corrmat.training.recipe import Recipe, Settings, default_settings, merge
 
 log = logging.getLogger("corrmat")
 _TRAINED = "trained.json"
@@ -44,12 +44,17 @@ def training_settings(arm: Arm) -> str:
 
     The data's folder, the number of workers and the number of test shapes do not count.
     """
-    settings = arm.settings.as_plain()
+    settings = _that_count(arm.settings.as_plain())
+    checksum = {"data": {"checksum": arm.datamodule.clouds("train").checksum()}}
+    return yaml.safe_dump(merge(settings, checksum), sort_keys=False)
+
+
+def _that_count(settings: Settings) -> Settings:
+    """Leave out the settings of the data that do not decide how an arm is trained."""
     data = cast(Settings, settings["data"])
-    for name in ("root", "name", "num_workers", "test_shapes"):
-        del data[name]
-    data["checksum"] = arm.datamodule.clouds("train").checksum()
-    return yaml.safe_dump(settings, sort_keys=False)
+    unimportant = ("root", "name", "num_workers", "test_shapes")
+    kept = {name: value for name, value in data.items() if name not in unimportant}
+    return settings | {"data": kept}
 
 
 def set_aside(folder: Path, arm: Arm) -> None:
@@ -138,5 +143,10 @@ def recorded_checkpoint(recipe: Recipe, arm: Arm, runs: Path) -> Path | None:
 
 
 def _same_settings(folder: Path, arm: Arm) -> bool:
+    """Tell whether a run had an arm's settings; options newer than the run had their defaults."""
     stored = folder / _SETTINGS
-    return stored.is_file() and stored.read_text() == training_settings(arm)
+    if not stored.is_file():
+        return False
+    defaults = _that_count(default_settings(arm.settings.method))
+    then = merge(defaults, yaml.safe_load(stored.read_text()))
+    return then == yaml.safe_load(training_settings(arm))
