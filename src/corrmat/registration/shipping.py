@@ -20,7 +20,6 @@ from corrmat.revision import commit
 from corrmat.types import PairBatch
 
 CALIBRATION_PAIRS = {512: 200, 1024: 100}  # of a protocol, by points of a cloud
-_TRAINING = Path("register", "training.json")  # below results/
 CALIBRATION_PROTOCOLS: tuple[benchmark.Protocol, ...] = ("real", "views", "clean")
 
 
@@ -47,34 +46,23 @@ def ship(checkpoint: Path, facts: Mapping[str, Any], results: Path) -> None:
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, trained on {pairs:,} pairs")
 
 
-def recalibrate(results: Path) -> None:
-    """Fit the confidence of the shipped weights anew, after a change of how they are used.
-
-    The recall of the last run in results/register/training.json is measured anew with it.
-    """
+def recalibrate() -> None:
+    """Fit the confidence of the shipped weights anew, after a change of how they are used."""
     about = weights.shipped_metadata()
     calibration, recalls = calibrate("corrmat")
     method, network = about.pop("method"), json.loads(about.pop("network"))
     about["calibration"] = json.dumps(calibration)
     path = weights.ship_network("corrmat", method, network, weights.load_model(), **about)
-    runs = _training_runs(results)
-    if runs:
-        runs[-1]["validation"] = recalls
-        replace_text(results / _TRAINING, json.dumps(runs, indent=1) + "\n")
     shares = ", ".join(f"{name} {recall:.0%}" for name, recall in recalls.items())
     print(f"{path}: calibrated; within 5 degrees on held-out pairs: {shares}")
 
 
 def add_training(results: Path, run: dict[str, object]) -> None:
     """Add a training run to results/register/training.json."""
-    runs = [*_training_runs(results), run]
-    (results / _TRAINING).parent.mkdir(parents=True, exist_ok=True)
-    replace_text(results / _TRAINING, json.dumps(runs, indent=1) + "\n")
-
-
-def _training_runs(results: Path) -> list[dict[str, object]]:
-    path = results / _TRAINING
-    return json.loads(path.read_text()) if path.is_file() else []
+    path = results / "register" / "training.json"
+    runs = json.loads(path.read_text()) if path.is_file() else []
+    path.parent.mkdir(parents=True, exist_ok=True)
+    replace_text(path, json.dumps([*runs, run], indent=1) + "\n")
 
 
 def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:
