@@ -8,6 +8,9 @@ and writes results/register/choice.json: the recall at 5 degrees and by ADD-S fo
 Three more rows say what limits it: the best candidate of every pair, which no choice can exceed;
 the true transform after ICP, which a symmetric shape slides away from; and the choice where that
 joins the candidates. The last rows compare how the chosen one is refined once more.
+
+`right_matches` is how many of the network's matches, by weight, the true transform explains, for
+several numbers of anchors that its points attend to.
 """
 
 import json
@@ -19,8 +22,9 @@ import numpy as np
 from rich.progress import track
 
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG
+from corrmat.networks.invariant import InvariantNetwork
 from corrmat.registration import benchmark
-from corrmat.registration.hypotheses import NetworkHypotheses
+from corrmat.registration.hypotheses import Hypotheses, NetworkHypotheses
 from corrmat.registration.register import (
     COHERENCE_WEIGHT,
     SUPPORT_WEIGHT,
@@ -50,6 +54,7 @@ IN_USE = COHERENCE_WEIGHT, SUPPORT_WEIGHT
 METHODS: tuple[IcpMethod, ...] = get_args(IcpMethod)
 REFINED = *METHODS, "the better of both"
 PAIRS = {"real": 400, "views": 300, "clean": 100}
+ANCHORS = 64, 128, 256, 1024
 _SEED = 5  # of pairs that nothing else uses
 
 
@@ -58,6 +63,7 @@ class PairTables(NamedTuple):
 
     candidates: np.ndarray  # (T + 1, 5) agreement, coherence, support, degrees and ADD-S
     refined: np.ndarray  # (3, 2) degrees and ADD-S of the chosen one, refined as in `REFINED`
+    right_matches: list[float]  # share of the matches, by weight, for each of `ANCHORS`
 
 
 def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> PairTables:
@@ -80,8 +86,23 @@ def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> Pair
         return [benchmark.errors(pairs, index, t) for t in in_units]
 
     return PairTables(
-        np.hstack([measures, errors_of(list(transforms))]), np.array(errors_of(refined))
+        np.hstack([measures, errors_of(list(transforms))]),
+        np.array(errors_of(refined)),
+        [matches_of(generate, count, subsamples).support(truth, *subsamples) for count in ANCHORS],
     )
+
+
+def matches_of(
+    generate: NetworkHypotheses, anchors: int, subsamples: tuple[np.ndarray, np.ndarray]
+) -> Hypotheses:
+    """Match two clouds whose points attend to so many anchors."""
+    network = generate.network
+    assert isinstance(network, InvariantNetwork)
+    usual, network.test_anchors = network.test_anchors, anchors
+    try:
+        return generate(*subsamples, 0)
+    finally:
+        network.test_anchors = usual
 
 
 def recalls(tables: Sequence[np.ndarray], weights: tuple[float, float] | None) -> dict[str, float]:
@@ -124,8 +145,12 @@ def main() -> None:
                 [table.refined[row] for table in measured]
             )
         count = float(np.mean([len(table) for table in without_truth]))
-        content[protocol] = {"pairs": len(pairs), "candidates": count, "weights": tried}
-        print(protocol, json.dumps(tried, indent=1), flush=True)
+        means = np.mean([table.right_matches for table in measured], 0).round(4).tolist()
+        right = dict(zip(map(str, ANCHORS), means, strict=True))
+        content[protocol] = {
+            "pairs": len(pairs), "candidates": count, "weights": tried, "right_matches": right,
+        }  # fmt: skip
+        print(protocol, json.dumps(content[protocol], indent=1), flush=True)
     PATH.write_text(json.dumps(content, indent=1) + "\n")
 
 

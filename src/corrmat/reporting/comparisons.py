@@ -88,6 +88,9 @@ def choice_table(results: Path) -> str:
         tried = [record[name]["weights"][weights] for name in protocols]
         shares = [f"{row['recall_5deg']:.1%}, {row['recall_adds']:.1%}" for row in tried]
         lines.append(markdown_row([weights, *shares]))
+    for anchors in record[protocols[0]]["right_matches"]:
+        right = [f"{record[name]['right_matches'][anchors]:.1%}" for name in protocols]
+        lines.append(markdown_row([f"right matches, {anchors} anchors", *right]))
     counts = ", ".join(f"{record[name]['pairs']} {name}" for name in protocols)
     means = ", ".join(f"{record[name]['candidates']:.0f} ({name})" for name in protocols)
     return "\n".join([*lines, "", f"{counts} pairs. Candidates a pair, in the mean: {means}."])
