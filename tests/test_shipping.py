@@ -76,6 +76,11 @@ def test_nothing_is_shipped_before_its_calibration_is_done(checkpoint, package, 
     assert [path.name for path in package.parent.iterdir()] == [package.name]
 
 
+def test_a_shape_gives_one_held_out_pair_at_most():
+    pairs = shipping.held_out_pairs("clean", 10_000, seed=0, points=16)
+    assert 100 < len(pairs) == len(set(pairs.shape.tolist()))
+
+
 def test_the_calibration_finds_the_chance_that_made_the_pairs():
     generator = torch.Generator().manual_seed(0)
     agreement, support = torch.rand(2, 4000, generator=generator, dtype=torch.float64)

@@ -96,13 +96,14 @@ def held_out_pairs(
 
     Args:
         protocol: one of `benchmark.PROTOCOLS`.
-        count: of pairs, spread over the shapes.
+        count: of pairs, spread over the shapes; at most one a shape.
         seed: of crops, noise and poses.
         points: of a cloud before it is cropped.
     """
     clouds = RegistrationDataModule(data="shapes+assemblies").clouds("val")
     families = np.flatnonzero([clouds.names[label] != "assembly" for label in clouds.labels])
-    chosen = families[np.linspace(0, len(families) - 1, count).round().astype(int)].tolist()
+    spread = np.linspace(0, len(families) - 1, min(count, len(families))).round().astype(int)
+    chosen = families[spread].tolist()
     keys = [Key(seed, STREAM["val"], 0, shape) for shape in chosen]
     settings = replace(benchmark.PROTOCOLS[protocol], num_points=points)
     return make_pairs(clouds, chosen, keys, settings)
