@@ -1,0 +1,99 @@
+"""What RPMNet's alpha does where the source is cropped (experiment 2.2).
+
+    python benchmarks/slack.py 2.2/RPMNet_corr shapes
+    python benchmarks/slack.py CHECKPOINT modelnet40 ROOT
+
+A target point without a match gives its share of the matrix to the slack row, which scores 0
+against -beta (distance^2 - alpha) of the source points. Where alpha exceeds every distance^2 the
+slack row gets nothing, and the share goes to source points that do not match. This tests a network
+with its own alpha and with alpha held, and adds a table of medians to results/slack.json.
+"""
+
+import json
+import sys
+from pathlib import Path
+
+import torch
+from rich.progress import track
+
+from corrmat.metrics import rotation_error_deg
+from corrmat.networks.rpmnet import AnnealingNet, RPMNetwork
+from corrmat.revision import commit
+from corrmat.training.preflight import prepare
+from corrmat.training.recipe import load
+from corrmat.types import PairBatch
+from corrmat.weights import load_model
+
+ROOT = Path(__file__).resolve().parents[1]
+PATH = ROOT / "results" / "slack.json"
+HELD = 0.0, 0.1, 1.0
+
+
+class HeldAlpha(AnnealingNet):
+    """An annealing network whose alpha is held, if it is given; it remembers what it said."""
+
+    def __init__(self, annealing: torch.nn.Module, alpha: float | None) -> None:
+        super(AnnealingNet, self).__init__()
+        self.annealing, self.alpha = annealing, alpha
+
+    def forward(
+        self, source: torch.Tensor, target: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Map clouds in one frame to beta and alpha, (B,) each."""
+        beta, alpha = self.annealing(source, target)
+        self.said = torch.stack([beta, alpha], 1)
+        return beta, alpha if self.alpha is None else torch.full_like(alpha, self.alpha)
+
+
+def errors_of(network: RPMNetwork, held: HeldAlpha, batch: PairBatch) -> torch.Tensor:
+    """Measure the pairs of a batch.
+
+    Returns:
+        (B, 5): degrees, units of translation, mean probability of the true match, beta, alpha.
+    """
+    prediction = network(batch.source, batch.target)
+    assert prediction.correspondence is not None
+    prob = prediction.correspondence.prob()
+    inlier = batch.match < prob.shape[2]
+    true = prob.gather(2, batch.match.clamp(max=prob.shape[2] - 1).unsqueeze(2)).squeeze(2)
+    columns = (
+        rotation_error_deg(prediction.rotation, batch.rotation),
+        (prediction.translation - batch.translation).norm(dim=-1),
+        (true * inlier).sum(1) / inlier.sum(1),
+        *held.said.unbind(1),
+    )
+    return torch.stack([column.double() for column in columns], 1)
+
+
+@torch.no_grad()
+def main(model: str, data: str, root: str | None = None) -> None:
+    """Test a network with its own alpha and with alpha held, and write the medians."""
+    network = load_model(model).eval()
+    assert isinstance(network, RPMNetwork)
+    overrides = {"data": {"data": data, "root": root}}
+    recipe = load(ROOT / "configs" / "exp" / "2.2.yaml", "laptop", overrides, ["RPMNet_corr"])
+    datamodule = prepare(recipe.arms["RPMNet_corr"]).datamodule
+    datamodule.setup("test")
+    annealing, rows = network.annealing, {}
+    for alpha in (None, *HELD):
+        network.annealing = held = HeldAlpha(annealing, alpha)
+        batches = track(datamodule.test_dataloader(), f"alpha {alpha}", transient=True)
+        errors = torch.cat([errors_of(network, held, batch) for batch in batches])
+        names = "rotation_error_deg", "translation_error", "true_match_prob", "beta", "alpha"
+        medians = errors.median(0).values.tolist()
+        rows["its own" if alpha is None else str(alpha)] = {
+            name: round(value, 4) for name, value in zip(names, medians, strict=True)
+        }
+        print(f"{data}, alpha {alpha}: {medians}", flush=True)
+    content = json.loads(PATH.read_text()) if PATH.is_file() else {}
+    content[data] = {
+        "commit": commit(),
+        "model": Path(model).name,
+        "pairs": len(errors),
+        "alpha": rows,
+    }
+    PATH.write_text(json.dumps(content, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
