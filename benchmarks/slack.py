@@ -1,7 +1,7 @@
 """What RPMNet's alpha does where the source is cropped (experiment 2.2).
 
-    python benchmarks/slack.py 2.2/RPMNet_corr shapes
-    python benchmarks/slack.py CHECKPOINT modelnet40 ROOT
+    python benchmarks/slack.py "overnight, shapes" 2.2/RPMNet_corr shapes
+    python benchmarks/slack.py "laptop, modelnet40" CHECKPOINT modelnet40 ROOT
 
 A target point without a match gives its share of the matrix to the slack row, which scores 0
 against -beta (distance^2 - alpha) of the source points. Where alpha exceeds every distance^2 the
@@ -66,8 +66,15 @@ def errors_of(network: RPMNetwork, held: HeldAlpha, batch: PairBatch) -> torch.T
 
 
 @torch.no_grad()
-def main(model: str, data: str, root: str | None = None) -> None:
-    """Test a network with its own alpha and with alpha held, and write the medians."""
+def main(name: str, model: str, data: str, root: str | None = None) -> None:
+    """Test a network with its own alpha and with alpha held, and write the medians.
+
+    Args:
+        name: of the network in the table.
+        model: shipped network or checkpoint.
+        data: to test on.
+        root: folder of the data set.
+    """
     network = load_model(model).eval()
     assert isinstance(network, RPMNetwork)
     overrides = {"data": {"data": data, "root": root}}
@@ -79,19 +86,12 @@ def main(model: str, data: str, root: str | None = None) -> None:
         network.annealing = held = HeldAlpha(annealing, alpha)
         batches = track(datamodule.test_dataloader(), f"alpha {alpha}", transient=True)
         errors = torch.cat([errors_of(network, held, batch) for batch in batches])
-        names = "rotation_error_deg", "translation_error", "true_match_prob", "beta", "alpha"
-        medians = errors.median(0).values.tolist()
-        rows["its own" if alpha is None else str(alpha)] = {
-            name: round(value, 4) for name, value in zip(names, medians, strict=True)
-        }
-        print(f"{data}, alpha {alpha}: {medians}", flush=True)
+        keys = "rotation_error_deg", "translation_error", "true_match_prob", "beta", "alpha"
+        medians = [round(value, 4) for value in errors.median(0).values.tolist()]
+        rows["its own" if alpha is None else str(alpha)] = dict(zip(keys, medians, strict=True))
+        print(f"{name}, alpha {alpha}: {medians}", flush=True)
     content = json.loads(PATH.read_text()) if PATH.is_file() else {}
-    content[data] = {
-        "commit": commit(),
-        "model": Path(model).name,
-        "pairs": len(errors),
-        "alpha": rows,
-    }
+    content[name] = {"commit": commit(), "pairs": len(errors), "alpha": rows}
     PATH.write_text(json.dumps(content, indent=1) + "\n")
 
 

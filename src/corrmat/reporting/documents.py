@@ -103,12 +103,12 @@ def slack_table(results: Path) -> str:
     lines = [markdown_row(heads), "|" + "---|" * len(heads)]
     path = results / "slack.json"
     tests = json.loads(path.read_text()) if path.is_file() else {}
-    for data, test in tests.items():
+    for name, test in sorted(tests.items()):
         for alpha, medians in test["alpha"].items():
             shown = f"its own, {medians['alpha']:.3g}" if alpha == "its own" else alpha
             degrees, units = medians["rotation_error_deg"], medians["translation_error"]
             share = f"{100 * medians['true_match_prob']:.1f}"
-            lines.append(markdown_row([data, shown, f"{degrees:.3g}", f"{units:.2g}", share]))
+            lines.append(markdown_row([name, shown, f"{degrees:.3g}", f"{units:.2g}", share]))
     return "\n".join(lines)
 
 
