@@ -7,6 +7,7 @@ import functools
 import io
 import json
 import math
+import multiprocessing
 import os
 import re
 import signal
@@ -212,13 +213,15 @@ def test_the_real_part_runs_by_the_same_command(tmp_path):
 
 
 def press_ctrl_c(during, step, patch):
-    """Ctrl-C in the middle of a training or validation step."""
+    """Ctrl-C in the middle of a training or validation step: a terminal tells every process."""
     original = getattr(RegistrationModule, during)
 
     def interrupted(self, batch, batch_index):
         result = original(self, batch, batch_index)
         if self.global_step == step and batch_index != 1:
             patch.undo()
+            for child in multiprocessing.active_children():
+                os.kill(child.pid, signal.SIGINT)
             os.kill(os.getpid(), signal.SIGINT)
         return result
 
@@ -233,6 +236,7 @@ def press_ctrl_c(during, step, patch):
         ("training_step", 13, 0),
         ("training_step", 13, 2),
         ("validation_step", 12, 0),
+        ("validation_step", 12, 2),
     ],
 )
 def test_ctrl_c_and_the_same_command_end_as_if_nothing_had_been(

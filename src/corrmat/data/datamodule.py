@@ -1,6 +1,7 @@
 """Pairs for training, validation and test, made on the fly from any data set of the registry."""
 
 import hashlib
+import signal
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -269,6 +270,7 @@ class RegistrationDataModule(L.LightningDataModule):
             batch_size=self.batch_size,
             sampler=sampler,
             num_workers=self.num_workers,
+            worker_init_fn=_ignore_ctrl_c,
             collate_fn=_already_a_batch,  # pyright: ignore[reportArgumentType] (see __getitems__)
             drop_last=training and len(sampler) >= self.batch_size,
             persistent_workers=self.num_workers > 0,
@@ -315,6 +317,11 @@ def data_name(data: str, root: str | None, name: str | None) -> str:
             f"{called} is another data set: its records would be overwritten; choose a --data.name"
         )
     return called
+
+
+def _ignore_ctrl_c(_worker: int) -> None:
+    """Leave Ctrl-C, which a terminal sends to every process, to the one that trains."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _already_a_batch(batch: PairBatch) -> PairBatch:
