@@ -5,9 +5,9 @@
 Candidates are compared by agreement + a * coherence + b * support (`registration/register.py`).
 This tries weights on pairs of training shapes that were held out of the training of the network,
 and writes results/register/choice.json: the recall at 5 degrees and by ADD-S for each (a, b).
-Three more rows say what limits it: the best candidate of every pair, which no choice can exceed;
-the true transform after ICP, which a symmetric shape slides away from; and the choice where that
-joins the candidates. The last rows compare how the chosen one is refined once more.
+Two more rows say what limits it: the best candidate of every pair, which no choice can exceed; and
+the choice where the true transform, after ICP, joins the candidates. The last rows compare how the
+chosen one, and the truth, are refined.
 
 `right_matches` is how many of the network's matches, by weight, the true transform explains, for
 several numbers of anchors that its points attend to.
@@ -16,7 +16,7 @@ several numbers of anchors that its points attend to.
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple, get_args
+from typing import NamedTuple
 
 import numpy as np
 from rich.progress import track
@@ -24,6 +24,7 @@ from rich.progress import track
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG
 from corrmat.networks.invariant import InvariantNetwork
 from corrmat.registration import benchmark
+from corrmat.registration.em_icp import em_icp
 from corrmat.registration.hypotheses import Hypotheses, NetworkHypotheses
 from corrmat.registration.register import (
     COHERENCE_WEIGHT,
@@ -32,7 +33,6 @@ from corrmat.registration.register import (
     prepare_clouds,
     to_original_units,
 )
-from corrmat.registration.scoring import IcpMethod
 from corrmat.registration.shipping import held_out_pairs
 from corrmat.revision import commit
 from corrmat.types import PairBatch
@@ -51,8 +51,7 @@ WEIGHTS = (
     (2.0, 0.4),
 )
 IN_USE = COHERENCE_WEIGHT, SUPPORT_WEIGHT
-METHODS: tuple[IcpMethod, ...] = get_args(IcpMethod)
-REFINED = *METHODS, "the better of both"
+REFINED = "generalised ICP", "EM-ICP without matches", "EM-ICP"
 PAIRS = {"real": 400, "views": 300, "clean": 100}
 ANCHORS = 64, 128, 256, 1024
 _SEED = 5  # of pairs that nothing else uses
@@ -63,6 +62,7 @@ class PairTables(NamedTuple):
 
     candidates: np.ndarray  # (T + 1, 5) agreement, coherence, support, degrees and ADD-S
     refined: np.ndarray  # (3, 2) degrees and ADD-S of the chosen one, refined as in `REFINED`
+    refined_truth: np.ndarray  # (3, 2) the same of the true transform
     right_matches: list[float]  # share of the matches, by weight, for each of `ANCHORS`
 
 
@@ -78,16 +78,20 @@ def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> Pair
     hypotheses = hypotheses._replace(transforms=np.stack([*hypotheses.transforms, truth]))
     transforms, measures = measure_candidates(hypotheses, subsamples, scorer)
     chosen = transforms[int(np.argmax(measures[:-1] @ [1, *IN_USE]))]
-    refined = [scorer.refine(chosen, method) for method in METHODS]
-    refined.append(scorer.refine_best(chosen, scorer))
 
-    def errors_of(transforms: Sequence[np.ndarray]) -> list[tuple[float, float]]:
+    def errors_of(transforms: Sequence[np.ndarray]) -> np.ndarray:
         in_units = [to_original_units(t, scale, x.centre, y.centre) for t in transforms]
-        return [benchmark.errors(pairs, index, t) for t in in_units]
+        return np.array([benchmark.errors(pairs, index, t) for t in in_units])
+
+    def refined(transform: np.ndarray) -> list[np.ndarray]:
+        priors = None, hypotheses.prob
+        em = [em_icp(transform[None], *subsamples, prior)[0] for prior in priors]
+        return [scorer.refine(transform), *em]
 
     return PairTables(
         np.hstack([measures, errors_of(list(transforms))]),
-        np.array(errors_of(refined)),
+        errors_of(refined(chosen)),
+        errors_of(refined(truth)),
         [matches_of(generate, count, subsamples).support(truth, *subsamples) for count in ANCHORS],
     )
 
@@ -137,12 +141,12 @@ def main() -> None:
         without_truth = [table[:-1] for table in tables]
         tried = {f"{a}, {b}": recalls(without_truth, (a, b)) for a, b in WEIGHTS}
         tried["best candidate"] = recalls(without_truth, None)
-        tried["the truth, after ICP"] = recalls([table[-1:] for table in tables], None)
         in_use = f"{IN_USE[0]}, {IN_USE[1]}"
         tried[f"{in_use}, the truth among the candidates"] = recalls(tables, IN_USE)
         for row, name in enumerate(REFINED):
-            tried[f"{in_use}, refined once more by {name}"] = shares(
-                [table.refined[row] for table in measured]
+            tried[f"{in_use}, then {name}"] = shares([table.refined[row] for table in measured])
+            tried[f"the truth, after {name}"] = shares(
+                [table.refined_truth[row] for table in measured]
             )
         count = float(np.mean([len(table) for table in without_truth]))
         means = np.mean([table.right_matches for table in measured], 0).round(4).tolist()

@@ -67,7 +67,7 @@ def test_matches_name_the_users_rows(pair):
     moved = source[sure[:, 0]] @ truth[:3, :3].T + truth[:3, 3]
     off = np.linalg.norm(moved - target[sure[:, 1]], axis=1)
     assert np.median(off) < 0.2 * example.MILLIMETRES
-    assert 0.3 < result.match_agrees.mean() < 1
+    assert result.match_agrees.mean() > 0.9
 
 
 def test_the_order_of_rows_does_not_matter_and_the_seed_decides(pair):
@@ -178,7 +178,9 @@ def test_small_clouds_are_registered_or_doubted():
 def test_clouds_that_have_nothing_in_common_are_doubtful(pair):
     _, source, _, _ = pair
     plane = np.random.default_rng(0).uniform(size=(900, 3)) * [1, 1, 0.001]
-    assert registration.register(source, plane).verdict.startswith("doubtful: ")
+    result = registration.register(source, plane)
+    assert result.verdict.startswith("doubtful: ")
+    assert result.match_agrees.mean() < 0.5
 
 
 def test_many_points_are_subsampled_evenly():
@@ -477,20 +479,3 @@ def test_points_that_are_near_on_one_side_are_coherent_and_scattered_ones_are_no
     same = AlignmentScorer(sphere, sphere).alignment(np.eye(4))
     assert same.coherence == 0  # all are near: there is nothing to explain
     assert same.agreement == pytest.approx(1, abs=1e-6)
-
-
-def test_the_last_refinement_is_the_better_of_two():
-    rng = np.random.default_rng(0)
-    shape = make_shape(("train", 3))[0][:, :3]
-    wins = set()
-    for noise in (0.01, 0.001, 0.01, 0.001):
-        points = rng.permutation(shape) + noise * rng.standard_normal(shape.shape)
-        scorer = AlignmentScorer(points[:500], points[500:1000])
-        start = np.eye(4)
-        start[:3, 3] = 0.05 * rng.standard_normal(3)
-        each = [scorer.refine(start, method) for method in ("GICP", "PLANE_ICP")]
-        scores = [sum(scorer.alignment(result)) for result in each]
-        best = int(np.argmax(scores))
-        wins.add(best)
-        np.testing.assert_array_equal(scorer.refine_best(start, scorer), each[best])
-    assert wins == {0, 1}

@@ -41,6 +41,7 @@ class Hypotheses(NamedTuple):
     transforms: np.ndarray  # (T, 4, 4) float64, T_target_source
     matches: np.ndarray  # (K, 2) int64 rows of source and target; K may be 0
     confidence: np.ndarray  # (K,) in [0, 1]
+    prob: torch.Tensor | None = None  # (N, M), probabilities of all matches
 
     def support(self, transform: np.ndarray, source: np.ndarray, target: np.ndarray) -> float:
         """Compute the share of the matches, by weight, that support a transform; 1 without any.
@@ -105,7 +106,8 @@ class NetworkHypotheses:
         best = best_distinct(rotation, score, _BY_AGREEMENT)
         transforms += [_matrix(rotation[k], translation[k]) for k in best]
         matches = torch.stack([i, j], 1).numpy()
-        return Hypotheses(np.stack([*transforms, *own_transform]), matches, weight.double().numpy())
+        transforms = np.stack([*transforms, *own_transform])
+        return Hypotheses(transforms, matches, weight.double().numpy(), prob)
 
     def _predict(self, x: torch.Tensor, y: torch.Tensor) -> tuple[np.ndarray, torch.Tensor | None]:
         """Run the network, wherever it lies, and leave it in the mode that it was in.

@@ -13,6 +13,7 @@ from torch import nn
 from corrmat.calibration import Calibration, shipped_calibration, verdict
 from corrmat.data.normals import estimate_normals
 from corrmat.errors import CorrmatError
+from corrmat.registration.em_icp import em_icp
 from corrmat.registration.hypotheses import (
     CLASSICAL,
     Hypotheses,
@@ -79,8 +80,7 @@ def register(
         model: "corrmat" for the shipped weights; "icp", or where they are installed "ransac",
             "ransac17", "fgr" or "kiss", for the classical pipelines; whatever else `load_model`
             takes; or a network, or a method, of your own.
-        refine: "icp" on up to 20,000 points of each cloud after the model, by the better of two
-            methods; or "none".
+        refine: "icp" after the model, see `refine_chosen`; or "none".
         seed: of subsampling and of the model's random draws.
 
     Returns:
@@ -106,11 +106,14 @@ def register(
     (x, y), scale, subsamples, scorer = prepare_clouds(source, target, seed)
     hypotheses = generate(*subsamples, seed)
     transforms, measures = measure_candidates(hypotheses, subsamples, scorer, refine)
-    best = int(np.argmax(measures @ [1.0, COHERENCE_WEIGHT, SUPPORT_WEIGHT]))
-    transform, (agreement, _, support) = transforms[best], measures[best].tolist()
+    transform = transforms[np.argmax(measures @ [1.0, COHERENCE_WEIGHT, SUPPORT_WEIGHT])]
     full = AlignmentScorer(x.points(scale, FULL_POINTS), y.points(scale, FULL_POINTS))
     if refine == "icp":
-        transform = full.refine_best(transform, scorer)
+        transform = refine_chosen(transform, hypotheses, subsamples, full)
+    agreement, support = (
+        scorer.alignment(transform).agreement,
+        hypotheses.support(transform, *subsamples),
+    )
     has_matches = len(hypotheses.matches) > 0
     confidence = _calibration().confidence(agreement, support if has_matches else None)
     overlap, rmse = full.overlap_and_rmse(transform)
@@ -119,7 +122,7 @@ def register(
         transform=to_original_units(transform, scale, x.centre, y.centre),
         matches=np.stack(rows, 1),
         match_confidence=hypotheses.confidence,
-        match_agrees=hypotheses.match_support(transforms[best], *subsamples) > 0,
+        match_agrees=hypotheses.match_support(transform, *subsamples) > 0,
         agreement=agreement,
         support=support,
         confidence=confidence,
@@ -172,6 +175,29 @@ def measure_candidates(
         transforms = np.stack([scorer.refine(transform) for transform in transforms])
     measures = [(*scorer.alignment(t), hypotheses.support(t, *subsamples)) for t in transforms]
     return transforms, np.array(measures)
+
+
+def refine_chosen(
+    transform: np.ndarray,
+    hypotheses: Hypotheses,
+    subsamples: tuple[np.ndarray, np.ndarray],
+    full: AlignmentScorer,
+) -> np.ndarray:
+    """Refine the chosen transform (4, 4): by EM-ICP, with the model's matches where it has any.
+
+    Generalised ICP follows where it is more exact: on points that the model has not seen, and on
+    points that both clouds share.
+
+    Args:
+        transform: of the source onto the target.
+        hypotheses: from which it was chosen.
+        subsamples: the clouds that they were made from.
+        full: scorer of the clouds, with all their points.
+    """
+    transform = em_icp(transform[None], *subsamples, hypotheses.prob)[0]
+    on_all = full.refine(transform)
+    more = max(len(full.source), len(full.target)) > MODEL_POINTS
+    return on_all if more or full.shares_points(on_all) else transform
 
 
 class Cloud:

@@ -1,7 +1,7 @@
 """Refinement and scoring of a transform by how well it aligns two clouds."""
 
 import functools
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple
 
 import numpy as np
 import small_gicp
@@ -9,7 +9,8 @@ from scipy.spatial import KDTree
 
 from corrmat.data.normals import NEIGHBORS
 
-IcpMethod = Literal["GICP", "PLANE_ICP"]
+_SAME = 0.02  # of `max_distance`: points that lie nearer than this are one point
+_SHARED = 0.1  # share of the source's points that are the target's, too
 
 
 class Alignment(NamedTuple):
@@ -56,32 +57,24 @@ class AlignmentScorer:
         source, target, _ = self._clouds
         return np.asarray(source.normals())[:, :3], np.asarray(target.normals())[:, :3]
 
-    def refine(self, transform: np.ndarray, method: IcpMethod = "GICP") -> np.ndarray:
-        """Refine a transform (4, 4) by generalised ICP (Segal et al., RSS 2009), or another."""
+    def refine(self, transform: np.ndarray) -> np.ndarray:
+        """Refine a transform (4, 4) by generalised ICP (Segal et al., RSS 2009)."""
         source, target, tree = self._clouds
         result = small_gicp.align(
             target,
             source,
             tree,
             transform,
-            registration_type=method,
+            registration_type="GICP",
             max_correspondence_distance=self.max_distance,
             max_iterations=30,
         )
         return np.asarray(result.T_target_source)
 
-    def refine_best(self, transform: np.ndarray, judge: "AlignmentScorer") -> np.ndarray:
-        """Refine a transform (4, 4) by both methods of ICP, and keep the better result.
-
-        Generalised ICP comes from farther away and slides less along walls. Point-to-plane ICP
-        (Chen and Medioni, 1992) is more exact where points are few and noisy.
-
-        Args:
-            transform: of the source onto the target.
-            judge: of the same clouds, perhaps with fewer points: tells which is better.
-        """
-        refined = [self.refine(transform, method) for method in get_args(IcpMethod)]
-        return max(refined, key=lambda result: sum(judge.alignment(result)))
+    def shares_points(self, transform: np.ndarray) -> bool:
+        """Tell whether a transform puts a tenth of the source's points exactly on target points."""
+        (distance, _), _ = self._nearest(transform)
+        return bool(np.mean(distance < _SAME * self.max_distance) > _SHARED)
 
     def alignment(self, transform: np.ndarray) -> Alignment:
         """Measure how well a transform (4, 4) puts the clouds on each other."""
