@@ -85,7 +85,7 @@ def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> Pair
 
     def refined(transform: np.ndarray) -> list[np.ndarray]:
         priors = None, hypotheses.prob
-        em = [em_icp(transform[None], *subsamples, prior)[0] for prior in priors]
+        em = [em_icp(transform, *subsamples, prior) for prior in priors]
         return [scorer.refine(transform), *em]
 
     return PairTables(

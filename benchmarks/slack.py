@@ -29,23 +29,22 @@ PATH = ROOT / "results" / "slack.json"
 HELD = 0.0, 0.1, 1.0
 
 
-class HeldAlpha(AnnealingNet):
-    """An annealing network whose alpha is held, if it is given; it remembers what it said."""
+class AlphaHolder:
+    """A forward hook of the annealing network: holds alpha, if it is given, and keeps both said."""
 
-    def __init__(self, annealing: torch.nn.Module, alpha: float | None) -> None:
-        super(AnnealingNet, self).__init__()
-        self.annealing, self.alpha = annealing, alpha
+    def __init__(self, alpha: float | None) -> None:
+        self.alpha = alpha
 
-    def forward(
-        self, source: torch.Tensor, target: torch.Tensor
+    def __call__(
+        self, annealing: AnnealingNet, inputs: object, output: tuple[torch.Tensor, torch.Tensor]
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Map clouds in one frame to beta and alpha, (B,) each."""
-        beta, alpha = self.annealing(source, target)
+        """Keep beta and alpha, (B,) each, and return what the network goes on with."""
+        beta, alpha = output
         self.said = torch.stack([beta, alpha], 1)
         return beta, alpha if self.alpha is None else torch.full_like(alpha, self.alpha)
 
 
-def errors_of(network: RPMNetwork, held: HeldAlpha, batch: PairBatch) -> torch.Tensor:
+def errors_of(network: RPMNetwork, holder: AlphaHolder, batch: PairBatch) -> torch.Tensor:
     """Measure the pairs of a batch.
 
     Returns:
@@ -60,7 +59,7 @@ def errors_of(network: RPMNetwork, held: HeldAlpha, batch: PairBatch) -> torch.T
         rotation_error_deg(prediction.rotation, batch.rotation),
         (prediction.translation - batch.translation).norm(dim=-1),
         (true * inlier).sum(1) / inlier.sum(1),
-        *held.said.unbind(1),
+        *holder.said.unbind(1),
     )
     return torch.stack([column.double() for column in columns], 1)
 
@@ -81,11 +80,13 @@ def main(name: str, model: str, data: str, root: str | None = None) -> None:
     recipe = load(ROOT / "configs" / "exp" / "2.2.yaml", "laptop", overrides, ["RPMNet_corr"])
     datamodule = prepare(recipe.arms["RPMNet_corr"]).datamodule
     datamodule.setup("test")
-    annealing, rows = network.annealing, {}
+    rows = {}
     for alpha in (None, *HELD):
-        network.annealing = held = HeldAlpha(annealing, alpha)
+        holder = AlphaHolder(alpha)
+        hook = network.annealing.register_forward_hook(holder)
         batches = track(datamodule.test_dataloader(), f"alpha {alpha}", transient=True)
-        errors = torch.cat([errors_of(network, held, batch) for batch in batches])
+        errors = torch.cat([errors_of(network, holder, batch) for batch in batches])
+        hook.remove()
         keys = "rotation_error_deg", "translation_error", "true_match_prob", "beta", "alpha"
         medians = [round(value, 4) for value in errors.median(0).values.tolist()]
         rows["its own" if alpha is None else str(alpha)] = dict(zip(keys, medians, strict=True))

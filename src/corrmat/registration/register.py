@@ -194,7 +194,7 @@ def refine_chosen(
         subsamples: the clouds that they were made from.
         full: scorer of the clouds, with all their points.
     """
-    transform = em_icp(transform[None], *subsamples, hypotheses.prob)[0]
+    transform = em_icp(transform, *subsamples, hypotheses.prob)
     on_all = full.refine(transform)
     more = max(len(full.source), len(full.target)) > MODEL_POINTS
     return on_all if more or full.shares_points(on_all) else transform
