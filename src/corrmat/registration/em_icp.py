@@ -51,7 +51,7 @@ def em_icp(
     for width in np.geomspace(*_WIDTHS, _ITERATIONS).tolist():
         moved, normals = x @ rotation.T + translation, n_x @ rotation.T
         match = _closeness(moved, y, width).mul_((normals @ n_y.T).abs_()).mul_(prior)
-        sums = _share(match) @ terms
+        sums = _sums_over_matches(match, terms)
         weight, sum_y, planes, on_planes = sums.split([1, 3, 9, 3], 1)
         apart = weight * moved - sum_y
         along = normals * (normals * apart).sum(1, keepdim=True)
@@ -79,14 +79,15 @@ def _closeness(x: Tensor, y: Tensor, width: float) -> Tensor:
     return (left @ right.T).clamp_(min=_LOG_LEAST).exp_()
 
 
-def _share(match: Tensor) -> Tensor:
-    """Divide each weight (N, M) by the root of its row's sum and of its column's sum.
+def _sums_over_matches(match: Tensor, terms: Tensor) -> Tensor:
+    """Sum terms (M, T) over the matches of each source point, by their weights (N, M).
 
-    So a point with many matches shares one weight among them; one without any has none.
+    Each weight is divided by the root of its row's sum and of its column's sum: a point with many
+    matches shares one weight among them, and one without any has none.
     """
     none = _OUTLIER * _LEAST_PROB
-    rows, columns = ((match.sum(axis, keepdim=True) + none).rsqrt() for axis in (1, 0))
-    return match.mul_(rows).mul_(columns)
+    rows, columns = ((match.sum(axis).unsqueeze(1) + none).rsqrt() for axis in (1, 0))
+    return rows * (match @ (columns * terms))
 
 
 def _gauss_newton(points: Tensor, force: Tensor, stiffness: Tensor) -> tuple[Tensor, Tensor]:
