@@ -8,7 +8,10 @@ network finds the match. The network knows where on the part a point lies, and h
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
+
+from corrmat.ops import rigid
 
 _WIDTHS = 0.1, 0.02  # standard deviation of the distance of a match, first and last
 _ITERATIONS = 10
@@ -63,7 +66,7 @@ def em_icp(
             _PLANE * off_planes + (1 - _PLANE) * apart,
             _PLANE * (planes + own_planes) + (1 - _PLANE) * weight.unsqueeze(2) * torch.eye(3),
         )
-        rotation, translation = step[0] @ rotation, step[0] @ translation + step[1]
+        rotation, translation = rigid.compose(step, (rotation, translation))
     refined = np.eye(4)
     u, _, v = torch.linalg.svd(rotation.double())
     refined[:3, :3], refined[:3, 3] = u @ v, translation
@@ -108,5 +111,5 @@ def _gauss_newton(points: Tensor, force: Tensor, stiffness: Tensor) -> tuple[Ten
     vector = torch.cat([torch.linalg.cross(points, force).sum(0), force.sum(0)])
     # Without any match there is nothing to balance, and no step.
     matrix = matrix.double() + 1e-6 * torch.eye(6)
-    step = -torch.linalg.solve(matrix, vector.double()).float()
-    return torch.linalg.matrix_exp(torch.linalg.cross(torch.eye(3), step[None, :3])), step[3:]
+    turn, shift = -torch.linalg.solve(matrix, vector.double()).float().view(2, 3)
+    return rigid.axis_angle_to_matrix(F.normalize(turn, dim=0), turn.norm()), shift

@@ -107,7 +107,9 @@ def register(
     hypotheses = generate(*subsamples, seed)
     transforms, measures = measure_candidates(hypotheses, subsamples, scorer, refine)
     transform = transforms[np.argmax(measures @ [1.0, COHERENCE_WEIGHT, SUPPORT_WEIGHT])]
-    full = AlignmentScorer(x.points(scale, FULL_POINTS), y.points(scale, FULL_POINTS))
+    full = scorer
+    if max(len(x.rows), len(y.rows)) > SELECTION_POINTS:
+        full = AlignmentScorer(x.points(scale, FULL_POINTS), y.points(scale, FULL_POINTS))
     if refine == "icp":
         transform = refine_chosen(transform, hypotheses, subsamples, full)
     agreement, support = (
@@ -195,9 +197,8 @@ def refine_chosen(
         full: scorer of the clouds, with all their points.
     """
     transform = em_icp(transform, *subsamples, hypotheses.prob)
-    on_all = full.refine(transform)
     more = max(len(full.source), len(full.target)) > MODEL_POINTS
-    return on_all if more or full.shares_points(on_all) else transform
+    return full.refine(transform) if more or full.shares_points(transform) else transform
 
 
 class Cloud:

@@ -72,7 +72,7 @@ class AlignmentScorer:
         return np.asarray(result.T_target_source)
 
     def shares_points(self, transform: np.ndarray) -> bool:
-        """Tell whether a transform puts a tenth of the source's points exactly on target points."""
+        """Tell whether a transform puts a tenth of the source's points on target points."""
         (distance, _), _ = self._nearest(transform)
         return bool(np.mean(distance < _SAME * self.max_distance) > _SHARED)
 
