@@ -3,4 +3,4 @@
 from corrmat.cli import sweep_rates
 
 if __name__ == "__main__":
-    sweep_rates(["1.2", "2.2", "3.2", "outliers"])
+    sweep_rates(["1.2", "1.3", "2.2", "3.2", "outliers"])
