@@ -117,12 +117,11 @@ def main() -> None:
     path = PLACE / "anatomy.json"
     measured = json.loads(path.read_text()) if path.is_file() else {}
     measured[label] = {}
-    for method, hparams, n, batch in bench.STEPS:
-        if n > MOST_POINTS:
+    for step in bench.STEPS:
+        name = bench.step_name(*step)
+        if step[2] > MOST_POINTS:
             continue
-        size = "laptop network" if hparams else "paper's network"
-        name = f"{method}, {size}, N={n}, batch {batch}"
-        measured[label][name] = bench.in_a_process(dissect, method, hparams, n, batch)
+        measured[label][name] = bench.in_a_process(dissect, *step)
         print(name, measured[label][name], flush=True)
     path.write_text(json.dumps(measured, indent=1) + "\n")
     draw(measured)

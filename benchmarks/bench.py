@@ -62,10 +62,12 @@ from corrmat.training.hardware import keep_freed_memory  # noqa: E402
 from corrmat.training.preflight import prepare  # noqa: E402
 from corrmat.training.recipe import load as load_recipe  # noqa: E402
 from corrmat.types import PairBatch  # noqa: E402
+from corrmat.weights import shipped_metadata  # noqa: E402
 
 Row = dict[str, Any]
 DCP_LAPTOP = {"width": 96, "feedforward": 192, "edge_channels": (32, 32, 64, 128), "k": 6}
 RPMNET_LAPTOP = {"width": 32, "k": 32, "annealing_width": 256}
+SHIPPED = json.loads(shipped_metadata("corrmat")["network"])
 # method, hyper-parameters, points, batch
 STEPS: tuple[tuple[str, dict[str, Any], int, int], ...] = (
     ("DCP_corr", DCP_LAPTOP, 128, 4),
@@ -76,7 +78,7 @@ STEPS: tuple[tuple[str, dict[str, Any], int, int], ...] = (
     ("PCRNet_corr", {}, 100, 32),
     ("PCRNet_corr", {}, 1024, 32),
     ("PCRNet", {}, 100, 8),
-    ("Invariant_corr", {}, 358, 8),
+    ("Invariant_corr", SHIPPED, 358, 8),
 )
 COMPILED = (STEPS[0],)
 POINTS = (256, 512, 1024, 2048, 4096, 8192)
@@ -100,7 +102,6 @@ def main() -> None:
         in_a_process(pairs_of_many_shapes),
     )
     for method, hparams, n, batch in STEPS:
-        size = "laptop network" if hparams else "paper's network"
         what = method, hparams, n, batch
         row = in_a_process(training_step, *what)
         row["peak_share"] = round(row.pop("gflop_a_pair") / row["ms_a_pair"] * 1e3 / peak, 2)
@@ -110,7 +111,7 @@ def main() -> None:
                 alone = in_a_process(released_step, *what, keep)
                 row[f"{name}_ratio"] = round(alone / row["ms_a_pair"], 2)
             row["released_peak_mb"] = in_a_process(peak_of_a_step, *what, released_loss)
-        add(f"step of {method}, {size}, N={n}, batch {batch}", row)
+        add(f"step of {step_name(*what)}", row)
     for method, hparams, n, batch in COMPILED:
         row = in_a_process(against_compiled, method, hparams, n, batch)
         first = row.pop("first_step_s")
@@ -151,6 +152,12 @@ def main() -> None:
     (place / "bench.json").write_text(json.dumps(content, indent=1) + "\n")
     draw(growth, exponents, place / "growth.png")
     print(f"written: {place.relative_to(ROOT)}/bench.json, growth.png")
+
+
+def step_name(method: str, hparams: dict[str, Any], n: int, batch: int) -> str:
+    """Name a step of `STEPS`."""
+    network = "shipped" if hparams is SHIPPED else "laptop" if hparams else "paper's"
+    return f"{method}, {network} network, N={n}, batch {batch}"
 
 
 def minutes_of(path: Path, arm: str) -> float:

@@ -17,6 +17,7 @@ import yaml
 from corrmat.reporting.intervals import (
     Estimate,
     PairErrors,
+    as_text,
     match_accuracy,
     median_rotation,
     p_of_equal_errors,
@@ -115,8 +116,8 @@ def less_error(evidence: Evidence) -> Claim:
     paper_ratio = theirs[0] / theirs[1] if theirs[0] and theirs[1] else None
     p = p_of_equal_errors(evidence.baseline, evidence.treatment)
     flips = evidence.baseline.flipped, evidence.treatment.flipped
-    arms = [_text(median_rotation(e), "deg") for e in (evidence.baseline, evidence.treatment)]
-    ours = f"{arms[0]} → {arms[1]}: {_text(ratio)} times"
+    arms = [as_text(median_rotation(e), "deg") for e in (evidence.baseline, evidence.treatment)]
+    ours = f"{arms[0]} → {arms[1]}: {as_text(ratio)} times"
     ours += f" (p {_p_text(p)}; flips {flips[0]} → {flips[1]})"
     if not learnt:
         identity = f"{evidence.identity_median_deg:g} deg"
@@ -133,7 +134,7 @@ def less_error(evidence: Evidence) -> Claim:
 def headline(evidence: Evidence) -> list[str]:
     """Return the cells of README's table: what both arms reached, and the verdict."""
     record = evidence.record
-    arms = [_text(median_rotation(e), "deg") for e in (evidence.baseline, evidence.treatment)]
+    arms = [as_text(median_rotation(e), "deg") for e in (evidence.baseline, evidence.treatment)]
     judged = less_error(evidence)
     pairs = record.arms[record.treatment].pairs_seen
     by_paper_metric = [record.arms[a].overall(paper_metric(record)) for a in record.compared]
@@ -142,7 +143,7 @@ def headline(evidence: Evidence) -> list[str]:
         f"{record.id} {record.family}, {record.title}",
         *arms,
         f"{ransac.median_deg:.2g} deg" if ransac else "",
-        _text(ratio_of_medians(evidence.baseline, evidence.treatment)),
+        as_text(ratio_of_medians(evidence.baseline, evidence.treatment)),
         ratio_cell(by_paper_metric),
         judged.paper.rpartition(": ")[2].removesuffix(" times"),
         f"{pairs:,} pairs, {record.data}",
@@ -198,7 +199,7 @@ def flat_over_misalignment(evidence: Evidence) -> Claim:
         "1.4: DCP_corr's error hardly grows with the misalignment (table 1)",
         "0.005 to 0.010 deg: 2 times",
         f"median {first_band.median_deg:.2g} deg in the first band, {last_band.median_deg:.2g} in "
-        f"the last: {_text(growth)} times",
+        f"the last: {as_text(growth)} times",
         evidence.where,
         verdict,
     )
@@ -235,8 +236,8 @@ def loss_not_rate(evidence: Evidence) -> Claim | None:
     return Claim(
         f"{record.id}: RPMNet_corr registers better than RPMNet at a high rate",
         "(RPMNet was unstable at high rates)",
-        f"{_text(median_rotation(evidence.errors[control]), 'deg')} → "
-        f"{_text(median_rotation(evidence.treatment), 'deg')}: {_text(ratio)} times",
+        f"{as_text(median_rotation(evidence.errors[control]), 'deg')} → "
+        f"{as_text(median_rotation(evidence.treatment), 'deg')}: {as_text(ratio)} times",
         evidence.where,
         verdict_of_ratio(ratio, None, evidence.left_identity(evidence.errors[control])),
     )
@@ -256,7 +257,7 @@ def unstable_at_high_rates(evidence: Evidence) -> Claim | None:
     return Claim(
         f"{evidence.record.id}: RPMNet is unstable at high rates",
         "trained at 1e-4 for that reason",
-        f"steady 1e-4 to one cycle at a high rate: median error falls {_text(ratio)} times, "
+        f"steady 1e-4 to one cycle at a high rate: median error falls {as_text(ratio)} times, "
         f"worst validation {worst:.3g} deg",
         evidence.where,
         verdict,
@@ -275,7 +276,7 @@ def matches_say_more(evidence: Evidence) -> Claim | None:
     return Claim(
         f"{evidence.record.id}: matches tell networks apart that degrees do not",
         "28.9 % → 99.7 %, 0.56 → 0.059 deg",
-        f"{_text(fewer, '%')} → {_text(more, '%')}; medians {_text(ratio)} times apart",
+        f"{as_text(fewer, '%')} → {as_text(more, '%')}; medians {as_text(ratio)} times apart",
         evidence.where,
         "confirmed" if alike and apart else "not shown",
     )
@@ -299,7 +300,7 @@ def below_seventy_per_cent(evidence: Evidence) -> Claim | None:
     return Claim(
         "3.1: PCRNet_corr cannot match 70 % of 1024 points",
         "63 %",
-        f"{_text(share, '%')} after {record.arms[record.treatment].pairs_seen:,} pairs, "
+        f"{as_text(share, '%')} after {record.arms[record.treatment].pairs_seen:,} pairs, "
         f"{100 * gain:.2g} points of them in the last quarter",
         evidence.where,
         verdict,
@@ -393,13 +394,6 @@ def markdown_claims(claims: Sequence[Claim]) -> str:
     lines = [markdown_row(heads), "|" + "---|" * len(heads)]
     lines += [markdown_row([c.words, c.paper, c.ours, c.where, f"**{c.verdict}**"]) for c in claims]
     return "\n".join(lines)
-
-
-def _text(estimate: Estimate, unit: str = "") -> str:
-    """Format an estimate with its interval."""
-    factor = 100 if unit == "%" else 1
-    value, low, high = (factor * x for x in (estimate.value, estimate.low, estimate.high))
-    return f"{value:.3g} [{low:.3g}, {high:.3g}]" + (f" {unit}" if unit else "")
 
 
 def _p_text(p: float) -> str:

@@ -25,6 +25,7 @@ from corrmat.reporting.comparisons import (
     draw_training,
     networks_table,
 )
+from corrmat.reporting.intervals import Estimate, as_text
 from corrmat.reporting.matrices import draw_matrices
 from corrmat.reporting.overview import draw_overview, longest_records
 from corrmat.reporting.record import Record, defined, read_records
@@ -109,6 +110,24 @@ def slack_table(results: Path) -> str:
             degrees, units = medians["rotation_error_deg"], medians["translation_error"]
             share = f"{100 * medians['true_match_prob']:.1f}"
             lines.append(markdown_row([name, shown, f"{degrees:.3g}", f"{units:.2g}", share]))
+    return "\n".join(lines)
+
+
+def low_rate_table(results: Path) -> str:
+    """Build the table of RPMNet_corr at RPMNet's steady rate in 2.2, beside the record's arms."""
+    heads = ["record", "pairs", "arm and rate", "median rotation error, deg", "correct matches"]
+    lines = [markdown_row(heads), "|" + "---|" * len(heads)]
+    path = results / "low_rate.json"
+    tests = json.loads(path.read_text()) if path.is_file() else {}
+    for name, test in sorted(tests.items()):
+        for arm, values in test["rows"].items():
+            degrees = as_text(Estimate(**values["median_deg"]))
+            matches = as_text(Estimate(**values["match_accuracy"]), "%")
+            lines.append(markdown_row([name, f"{test['pairs_seen']:,}", arm, degrees, matches]))
+    for name, test in sorted(tests.items()):
+        ratio = as_text(Estimate(**test["ratio_at_the_low_rate"]))
+        said = f"{name}: at the same steady rate RPMNet's median is {ratio} times RPMNet_corr's."
+        lines += ["", said]
     return "\n".join(lines)
 
 
@@ -198,6 +217,7 @@ TABLES: tuple[tuple[str, str, Callable[[Results], str]], ...] = (
     ("docs/reproduction.md", "results", lambda results: markdown_summary(results.records)),
     ("docs/reproduction.md", "rates", lambda results: rates_table(results.folder)),
     ("docs/reproduction.md", "slack", lambda results: slack_table(results.folder)),
+    ("docs/reproduction.md", "low_rate", lambda results: low_rate_table(results.folder)),
     ("docs/reproduction.md", "weights", lambda results: weights_table(results.records)),
     ("docs/reproduction.md", "seeds", lambda results: seeds_table(results.folder)),
     ("docs/reproduction.md", "tables", lambda results: markdown_tables(results.records)),

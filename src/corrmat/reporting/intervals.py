@@ -53,6 +53,13 @@ class Estimate:
     high: float
 
 
+def as_text(estimate: Estimate, unit: str = "") -> str:
+    """Format an estimate with its interval."""
+    factor = 100 if unit == "%" else 1
+    value, low, high = (factor * x for x in (estimate.value, estimate.low, estimate.high))
+    return f"{value:.3g} [{low:.3g}, {high:.3g}]" + (f" {unit}" if unit else "")
+
+
 def read_errors(path: Path) -> dict[str, PairErrors]:
     """Read a per_pair.csv: the errors of every arm and baseline."""
     rows: dict[str, list[dict[str, str]]] = defaultdict(list)

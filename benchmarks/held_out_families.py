@@ -1,0 +1,63 @@
+"""What the network loses on families that it was not trained on, and what assemblies change.
+
+    python benchmarks/held_out_families.py        two hours on one core; goes on if interrupted
+
+Four small trainings: each leaves out one of two groups of ten families, with and without random
+assemblies among its shapes. All are tested on the same `real` pairs of both groups, so that every
+pair is of a family seen for one network and not seen for the other. The record is
+results/register/held_out_families.json.
+"""
+
+import sys
+from dataclasses import fields
+from pathlib import Path
+
+from corrmat.cli import main as corrmat
+from corrmat.data.shapes.dataset import NAMES, SIZE
+from corrmat.registration import benchmark
+from corrmat.types import PairBatch
+
+ROOT = Path(__file__).resolve().parents[1]
+GROUPS = {"first": NAMES[0::4], "second": NAMES[2::4]}
+DATA = {"families": "shapes", "families and assemblies": "shapes+assemblies"}
+SETTINGS = {"start": "null", "network.layers": 2, "trainer.max_steps": 1500}  # 12,000 pairs
+
+
+def train(data: str, left_out: str) -> Path:
+    """Train on a data set without a group of families; return the checkpoint."""
+    categories = [name for name in NAMES if name not in GROUPS[left_out]]
+    categories += ["assembly"] if "assemblies" in data else []
+    name = f"{data}-without-{left_out}"
+    settings = SETTINGS | {"data.data": data, "data.name": name, "data.categories": categories}
+    words = [f"--{option}={value}" for option, value in settings.items()]
+    code = corrmat(["fit", "--config", str(ROOT / "configs" / "weights.yaml"), *words])
+    if code:
+        sys.exit(code)
+    return Path("runs", "laptop", name, "weights", "Invariant_corr", "last.ckpt")
+
+
+def pairs_of(pairs: PairBatch, group: str) -> PairBatch:
+    """Select the pairs of the families of a group."""
+    families = [NAMES[shape % len(NAMES)] for shape in pairs.shape]
+    chosen = [row for row, family in enumerate(families) if family in GROUPS[group]]
+    return PairBatch(**{f.name: getattr(pairs, f.name)[chosen] for f in fields(pairs)})
+
+
+def main() -> None:
+    """Train the four, then test each on both groups."""
+    pairs = benchmark.frozen_pairs("real", count=SIZE["test"])
+    results = {}
+    for words, data in DATA.items():
+        for left_out in GROUPS:
+            model = str(train(data, left_out))
+            for group in GROUPS:
+                tested = benchmark.compare(pairs_of(pairs, group), [model])[model]
+                results[f"{words}, without the {left_out} group, on the {group}"] = tested
+    print(benchmark.to_table(results))
+    about = {"protocol": "real", "points": 512, **{name: list(g) for name, g in GROUPS.items()}}
+    path = ROOT / "results" / "register" / "held_out_families.json"
+    benchmark.write_results(path, results, about | {"settings": SETTINGS})
+
+
+if __name__ == "__main__":
+    main()
