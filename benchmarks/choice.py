@@ -23,6 +23,7 @@ from rich.progress import track
 
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG
 from corrmat.networks.invariant import InvariantNetwork
+from corrmat.ops import rigid
 from corrmat.registration import benchmark
 from corrmat.registration.em_icp import em_icp
 from corrmat.registration.hypotheses import Hypotheses, NetworkHypotheses
@@ -71,10 +72,8 @@ def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> Pair
     source, target = (c[index].double().numpy() for c in (pairs.source, pairs.target))
     (x, y), scale, subsamples, scorer = prepare_clouds(source, target, 0)
     hypotheses = generate(*subsamples, 0)
-    truth = np.eye(4)
-    truth[:3, :3] = pairs.rotation[index].double()
-    truth[:3, 3] = truth[:3, :3] @ x.centre + pairs.translation[index].double().numpy() - y.centre
-    truth[:3, 3] *= scale
+    rotation, translation = pairs.rotation[index].double().numpy(), pairs.translation[index].numpy()
+    truth = rigid.to_homogeneous(rotation, scale * (rotation @ x.centre + translation - y.centre))
     hypotheses = hypotheses._replace(transforms=np.stack([*hypotheses.transforms, truth]))
     transforms, measures = measure_candidates(hypotheses, subsamples, scorer)
     chosen = transforms[int(np.argmax(measures[:-1] @ [1, *IN_USE]))]

@@ -1,6 +1,6 @@
 """What the network loses on families that it was not trained on, and what assemblies change.
 
-    python benchmarks/held_out_families.py        two hours on one core; goes on if interrupted
+    python benchmarks/held_out_families.py        forty minutes on one core; goes on if interrupted
 
 Four small trainings: each leaves out one of two groups of ten families, with and without random
 assemblies among its shapes. All are tested on the same `real` pairs of both groups, so that every
@@ -20,7 +20,7 @@ from corrmat.types import PairBatch
 ROOT = Path(__file__).resolve().parents[1]
 GROUPS = {"first": NAMES[0::4], "second": NAMES[2::4]}
 DATA = {"families": "shapes", "families and assemblies": "shapes+assemblies"}
-SETTINGS = {"start": "null", "network.layers": 2, "trainer.max_steps": 1500}  # 12,000 pairs
+SETTINGS = {"start": "null", "network.layers": 2, "trainer.max_steps": 1000}  # 8,000 pairs
 
 
 def train(data: str, left_out: str) -> Path:

@@ -181,9 +181,7 @@ def kiss_matcher(
     )
     clouds = (list(points[:, :3].astype(np.float32)) for points in (source, target))
     solution = package.KISSMatcher(config).estimate(*clouds)
-    transform = np.eye(4)
-    transform[:3, :3], transform[:3, 3] = solution.rotation, np.ravel(solution.translation)
-    return transform
+    return rigid.to_homogeneous(solution.rotation, np.ravel(solution.translation))
 
 
 def _open3d() -> Any:  # noqa: ANN401

@@ -3,7 +3,9 @@
 Convention everywhere: `R @ x + t` takes the source onto the target.
 """
 
+import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 
@@ -41,6 +43,14 @@ def invert(rotation: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
     inverse = rotation.mT
     with torch.autocast(rotation.device.type, enabled=False):
         return inverse, -(inverse @ translation.unsqueeze(-1)).squeeze(-1)
+
+
+def to_homogeneous(rotation: ArrayLike | Tensor, translation: ArrayLike | Tensor) -> np.ndarray:
+    """Build the (..., 4, 4) float64 matrices of transforms ((..., 3, 3), (..., 3)) on a CPU."""
+    rotation, translation = np.asarray(rotation), np.asarray(translation)
+    matrix = np.zeros((*translation.shape[:-1], 4, 4))
+    matrix[..., :3, :3], matrix[..., :3, 3], matrix[..., 3, 3] = rotation, translation, 1
+    return matrix
 
 
 def axis_angle_to_matrix(axis: Tensor, angle_rad: Tensor) -> Tensor:

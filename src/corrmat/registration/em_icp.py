@@ -67,10 +67,8 @@ def em_icp(
             _PLANE * (planes + own_planes) + (1 - _PLANE) * weight.unsqueeze(2) * torch.eye(3),
         )
         rotation, translation = rigid.compose(step, (rotation, translation))
-    refined = np.eye(4)
     u, _, v = torch.linalg.svd(rotation.double())
-    refined[:3, :3], refined[:3, 3] = u @ v, translation
-    return refined
+    return rigid.to_homogeneous(u @ v, translation)
 
 
 def _closeness(x: Tensor, y: Tensor, width: float) -> Tensor:

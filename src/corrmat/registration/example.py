@@ -45,8 +45,7 @@ def write_example(folder: Path) -> None:
     angle = torch.deg2rad(torch.tensor([130.0], dtype=torch.float64))
     rotation = rigid.axis_angle_to_matrix(axis, angle)[0].numpy()
     translation = np.array([1200.0, -700.0, 500.0])
-    transform = np.eye(4)
-    transform[:3, :3], transform[:3, 3] = rotation, translation
+    transform = rigid.to_homogeneous(rotation, translation)
     write_ply(folder / "source.ply", scans[0])
     write_ply(folder / "target.ply", scans[1] @ rotation.T + translation)
     replace_text(

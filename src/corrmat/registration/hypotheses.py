@@ -23,6 +23,7 @@ from corrmat.baselines import (
     kiss_matcher,
 )
 from corrmat.errors import CorrmatError
+from corrmat.ops import rigid
 from corrmat.ops.ransac import best_by_matches, best_distinct, fit_triples
 
 _STRONGEST = 256  # matches that RANSAC draws from
@@ -99,14 +100,14 @@ class NetworkHypotheses:
         i, j = place // prob.shape[1], place % prob.shape[1]
         weighted = x[0, i, :3], y[0, j, :3], weight.sqrt(), _INLIER_THRESHOLD
         fits = fit_triples(*weighted, generator=torch.Generator().manual_seed(seed))
-        rotation, translation, _ = best_by_matches(*fits, *weighted, _BY_MATCHES)
-        transforms = [_matrix(r, t) for r, t in zip(rotation, translation, strict=True)]
+        by_matches = best_by_matches(*fits, *weighted, _BY_MATCHES)[:2]
         rotation, translation = (t[:_RANKED] for t in fits)
         score = rough_agreement(rotation, translation, x[0], y[0])
         best = best_distinct(rotation, score, _BY_AGREEMENT)
-        transforms += [_matrix(rotation[k], translation[k]) for k in best]
+        by_agreement = rotation[best], translation[best]
+        ranked = [rigid.to_homogeneous(*fit) for fit in (by_matches, by_agreement)]
+        transforms = np.concatenate([*ranked, own_transform])
         matches = torch.stack([i, j], 1).numpy()
-        transforms = np.stack([*transforms, *own_transform])
         return Hypotheses(transforms, matches, weight.double().numpy(), prob)
 
     def _predict(self, x: torch.Tensor, y: torch.Tensor) -> tuple[np.ndarray, torch.Tensor | None]:
@@ -130,7 +131,7 @@ class NetworkHypotheses:
         finally:
             for module, mode in modes:
                 module.training = mode
-        transform = _matrix(prediction.rotation[0].cpu(), prediction.translation[0].cpu())[None]
+        transform = rigid.to_homogeneous(prediction.rotation.cpu(), prediction.translation.cpu())
         if not np.isfinite(transform).all():
             raise CorrmatError("the network's transform is not finite: has its training diverged?")
         if prediction.correspondence is None:
@@ -165,17 +166,10 @@ def rough_agreement(
     return (parallel * torch.from_numpy(closeness)).mean(1)
 
 
-def _matrix(rotation: torch.Tensor, translation: torch.Tensor) -> np.ndarray:
-    transform = np.eye(4)
-    transform[:3, :3], transform[:3, 3] = rotation.double(), translation.double()
-    return transform
-
-
 def icp(source: np.ndarray, target: np.ndarray, seed: int) -> Hypotheses:
     """Return one hypothesis, centroid on centroid: everything else is left to ICP."""
-    transform = np.eye(4)
-    transform[:3, 3] = target[:, :3].mean(0) - source[:, :3].mean(0)
-    return Hypotheses(transform[None], *_NO_MATCHES)
+    shift = target[:, :3].mean(0) - source[:, :3].mean(0)
+    return Hypotheses(rigid.to_homogeneous(np.eye(3), shift)[None], *_NO_MATCHES)
 
 
 def ransac(

@@ -13,6 +13,7 @@ from torch import nn
 
 from corrmat.calibration import verdict
 from corrmat.errors import CorrmatError
+from corrmat.ops import rigid
 from corrmat.registration.register import Cloud, Refine, matrix_lines, register
 
 _SWEEPS = 50  # of averaging; poses settle within ten
@@ -127,9 +128,9 @@ class _PoseGraph:
 
     def pose(self, index: int) -> ScanPose:
         """Return the pose of a scan."""
-        transform = np.eye(4)
-        transform[:3, :3] = self.rotations[index]
-        transform[:3, 3] = self.images[index] - self.rotations[index] @ self.centres[index]
+        rotation = self.rotations[index]
+        translation = self.images[index] - rotation @ self.centres[index]
+        transform = rigid.to_homogeneous(rotation, translation)
         confidence, mine = float(self.confidence[index]), self._edges_of(index)
         agree = sum(self._agrees(index, *self._predict(index, edge)) for edge in mine)
         reason = f"{agree} of {len(mine)} registrations agree"
