@@ -41,7 +41,7 @@ def test_the_recipes_train_at_the_chosen_rates(path, scale):
 
 
 def test_there_is_a_sweep_of_every_family():
-    assert {"1.2", "2.2", "3.2", "outliers"} <= {path.stem for path in SWEPT}
+    assert {"1.2", "1.3", "2.2", "3.2", "outliers"} <= {path.stem for path in SWEPT}
 
 
 def rate(lr, error):
