@@ -67,6 +67,18 @@ def test_equal_arms_have_a_large_p_and_others_a_small_one():
 
 
 @pytest.mark.parametrize(
+    ("times_the_pairs", "ratio", "verdict"),
+    [
+        (1.5, (9, 8, 10), "confirmed"),
+        (14, (9, 8, 10), "not shown"),  # more pairs may be why it is better
+        (14, (0.8, 0.7, 0.9), "contradicted"),  # worse in spite of them
+    ],
+)
+def test_a_method_corr_that_saw_far_more_pairs_shows_nothing(times_the_pairs, ratio, verdict):
+    assert verdict_of_ratio(Estimate(*ratio), 10, True, times_the_pairs) == verdict
+
+
+@pytest.mark.parametrize(
     ("ratio", "paper", "learnt", "verdict"),
     [
         ((9, 8, 10), 10, True, "confirmed"),

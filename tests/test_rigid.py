@@ -29,7 +29,8 @@ def test_homogeneous_matrices_move_as_apply_does(generator):
     r, t = random_rotation(4, generator), torch.randn(4, 3, generator=generator)
     x = torch.randn(4, 9, 3, generator=generator, dtype=torch.float64)
     matrix = rigid.to_homogeneous(r, t)
-    assert matrix.shape == (4, 4, 4) and matrix.dtype == np.float64
+    assert matrix.shape == (4, 4, 4)
+    assert matrix.dtype == np.float64
     moved = np.concatenate([x.numpy(), np.ones((4, 9, 1))], -1) @ matrix.swapaxes(1, 2)
     np.testing.assert_allclose(moved[..., :3], rigid.apply(r, t.double(), x), atol=1e-12)
     np.testing.assert_array_equal(moved[..., 3], 1)

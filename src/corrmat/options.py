@@ -89,6 +89,7 @@ verdict: "aligned" from a confidence of 90 % on, "probably aligned" from 50 %, e
 exit codes: 0 done, whatever the verdict; 2 a file cannot be used, and one line says why."""
 
 Scale = Literal["smoke", "laptop", "overnight", "paper"]
+RESULTS_HELP = "folder of the records"
 EXPERIMENT_COMMANDS = ("run", "fit", "evaluate")
 
 
@@ -206,8 +207,8 @@ def build_parser(with_settings: Sequence[str] = ()) -> ArgumentParser:
         "--scale", type=Scale, default="laptop",
         help="smoke: 20 draws a point of a curve instead of 400",
     )  # fmt: skip
-    robustness.add_argument("--results", type=Path, default=Path("results"), help="of records")
-    robustness.add_argument("--seed", type=_count, default=0, help="of the draws")
+    robustness.add_argument("--results", type=Path, default=Path("results"), help=RESULTS_HELP)
+    robustness.add_argument("--seed", type=_count, default=0, help="seed of the random draws")
     data = add(
         "data", "make the embedded data set, or fetch ModelNet40",
         "examples:\n  corrmat data --sheet a.png\n  corrmat data modelnet40 --root /data",
@@ -223,7 +224,7 @@ def build_parser(with_settings: Sequence[str] = ()) -> ArgumentParser:
         "report", "one page, or the documents' tables, from results/",
         "examples:\n  corrmat report -o report.html\n  corrmat report results/ --docs .",
     )  # fmt: skip
-    report.add_argument("results", nargs="?", type=Path, default=Path("results"), help="of records")
+    report.add_argument("results", nargs="?", type=Path, default=Path("results"), help=RESULTS_HELP)
     report.add_argument("-o", "--output", type=Path, help="write all records as one HTML page")
     report.add_argument(
         "--docs", type=Path, help="folder of README.md and docs/: rewrite tables, redraw pictures"
@@ -238,8 +239,8 @@ def _add_experiment_options(
 ) -> None:
     """Add the options of run, fit and evaluate."""
     parser.add_argument("--config", type=Path, help="the experiment, e.g. configs/exp/1.1.yaml")
-    parser.add_argument("--scale", type=Scale, default="laptop", help="of the experiment")
-    parser.add_argument("--runs", type=Path, default=Path("runs"), help="of checkpoints and logs")
+    parser.add_argument("--scale", type=Scale, default="laptop", help="how large, how long")
+    parser.add_argument("--runs", type=Path, default=Path("runs"), help="folder of checkpoints")
     if name in ("run", "fit"):
         parser.add_argument(
             "--logger", type=Literal["none", "csv", "wandb"], default="wandb",
@@ -254,7 +255,7 @@ def _add_experiment_options(
             "-v", "--verbose", action="store_true", help="Lightning's messages, too"
         )
     if name == "run":
-        parser.add_argument("--results", type=Path, default=Path("results"), help="of records")
+        parser.add_argument("--results", type=Path, default=Path("results"), help=RESULTS_HELP)
     else:
         parser.add_argument("--arm", help="one of the recipe's arms (default: its METHOD_corr)")
     if name == "evaluate":
@@ -303,13 +304,13 @@ def _add_register_options(parser: ArgumentParser) -> None:
     parser.add_argument("--gif", type=Path, help="write an animation of the same")
     parser.add_argument(
         "--model", default="corrmat",
-        help="corrmat (the shipped weights), icp, ransac, fgr, kiss, a checkpoint file, a folder "
-        "of corrmat export, or hf:name/model",
+        help="corrmat (the shipped weights), icp, ransac, ransac17, fgr, kiss, a shipped arm "
+        "(1.2/DCP_corr), a checkpoint file, a folder of corrmat export, or hf:name/model",
     )  # fmt: skip
     parser.add_argument(
         "--refine", type=Literal["icp", "none"], default="icp", help="refinement after the model"
     )
-    parser.add_argument("--seed", type=_count, default=0, help="of subsampling and random draws")
+    parser.add_argument("--seed", type=_count, default=0, help="seed of the random draws")
 
 
 def _count(text: str) -> int:

@@ -29,6 +29,7 @@ from corrmat.reporting.tables import markdown_row, paper_metric, ratio_cell
 
 Verdict = Literal["confirmed", "confirmed in direction", "not shown", "contradicted"]
 LEFT_BASELINE = 0.5  # of identity's median error: an arm above it has learnt nothing to compare
+FAIR_SHARE = 1.5  # METHOD_corr may see so many times METHOD's pairs; more, and it shows nothing
 NEAR_PAPER = 0.5  # of the paper's ratio: less is a confirmation of the direction only
 FLAT = 2.0  # growth of the error from the first to the last band of table 1
 STILL_LEARNING = 0.01  # gain of matches over the last quarter of a training that had not ended
@@ -74,6 +75,12 @@ class Evidence:
         seed = f", seed {self.record.seed}" if self.record.seed else ""
         return f"{self.record.scale}, {self.record.data}{seed}"
 
+    @property
+    def times_the_pairs(self) -> float:
+        """How many of METHOD's training pairs METHOD_corr saw for each one; 1 if not recorded."""
+        baseline, treatment = (self.record.arms[arm].pairs_seen for arm in self.record.compared)
+        return treatment / baseline if baseline and treatment else 1.0
+
     def left_identity(self, errors: PairErrors) -> bool:
         """Tell whether an arm is clearly better than guessing the identity."""
         return errors.median_deg < LEFT_BASELINE * self.identity_median_deg
@@ -89,19 +96,22 @@ def read_evidence(record: Record, results: Path) -> Evidence:
     return Evidence(record, read_errors(folder / "per_pair.csv"), largest / 2)
 
 
-def verdict_of_ratio(ratio: Estimate, paper: float | None, baseline_learnt: bool) -> Verdict:
+def verdict_of_ratio(
+    ratio: Estimate, paper: float | None, baseline_learnt: bool, times_the_pairs: float = 1.0
+) -> Verdict:
     """Judge "METHOD_corr errs less than METHOD".
 
     Args:
         ratio: of METHOD's median error to METHOD_corr's.
         paper: the same ratio in the paper; None if it gives none.
         baseline_learnt: whether METHOD left the identity guess; else it shows nothing.
+        times_the_pairs: training pairs of METHOD_corr for each of METHOD; far more show nothing.
     """
     if not baseline_learnt:
         return "not shown"
     if ratio.high < 1:
         return "contradicted"
-    if ratio.low <= 1:
+    if ratio.low <= 1 or times_the_pairs > FAIR_SHARE:
         return "not shown"
     near = paper is not None and ratio.value >= NEAR_PAPER * paper
     return "confirmed" if near else "confirmed in direction"
@@ -122,12 +132,14 @@ def less_error(evidence: Evidence) -> Claim:
     if not learnt:
         identity = f"{evidence.identity_median_deg:g} deg"
         ours += f"; {record.baseline} errs by at least half of the identity guess's {identity}"
+    if evidence.times_the_pairs > FAIR_SHARE:
+        ours += f"; {record.treatment} saw {evidence.times_the_pairs:.3g} times as many pairs"
     return Claim(
         f"{record.id}: {record.treatment} registers better than {record.baseline} ({record.title})",
         f"{theirs[0]:.3g} → {theirs[1]:.3g} deg: {paper_ratio:.3g} times" if paper_ratio else "",
         ours,
         evidence.where,
-        verdict_of_ratio(ratio, paper_ratio, learnt),
+        verdict_of_ratio(ratio, paper_ratio, learnt, evidence.times_the_pairs),
     )
 
 

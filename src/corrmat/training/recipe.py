@@ -157,7 +157,9 @@ def add_settings(parser: ArgumentParser, methods: Sequence[str] | None = None) -
         methods: the options of these methods' networks and losses; of all by default.
     """
     classes = [METHODS[name] for name in (METHODS if methods is None else methods)]
-    parser.add_argument("--seed", type=int, default=0, help="of weights, pairs and held-out shapes")
+    parser.add_argument(
+        "--seed", type=int, default=0, help="seed of weights, pairs and held-out shapes"
+    )
     parser.add_argument(
         "--start", type=str | None, default=None,
         help="weights to start from, as --model of corrmat register takes them",
