@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, cast
 
+import docstring_parser
 import lightning as L
 import yaml
 from jsonargparse import ArgumentParser, Namespace
@@ -194,11 +195,13 @@ def _add_union(parser: ArgumentParser, group: str, classes: Sequence[type]) -> N
     parser.add_class_arguments(first, group, instantiate=False)
     for other in others:
         hints = typing.get_type_hints(other.__init__)
+        documented = docstring_parser.parse(other.__doc__ or "").params
+        described = {parameter.arg_name: parameter.description for parameter in documented}
         for name, parameter in _parameters(other).items():
             if name not in added:
                 parser.add_argument(
                     f"--{group}.{name}", type=hints.get(name, Any), default=parameter.default,
-                    help=f"see {other.__name__}",
+                    help=f"of {other.__name__}: {described.get(name, '')}",
                 )  # fmt: skip
                 added.add(name)
 
