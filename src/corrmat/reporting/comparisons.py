@@ -75,6 +75,34 @@ def networks_table(results: Path) -> str:
     return "\n".join(lines)
 
 
+def families_table(results: Path) -> str:
+    """Build the table of networks trained without some families: recall on those and on others.
+
+    The same pairs are tested with the network that has not seen their families and with the one
+    that has; p is the exact McNemar test's between the two.
+    """
+    path = results / "register" / "held_out_families.json"
+    if not path.is_file():
+        return "No test is recorded."
+    tested = json.loads(path.read_text())["models"]
+    hits: dict[str, dict[str, list[np.ndarray]]] = {}
+    for name, row in tested.items():
+        shapes, left_out, test = name.split("/")
+        kind = test if test == "modelnet40" else "unseen" if test == left_out else "seen"
+        hits.setdefault(shapes, {}).setdefault(kind, []).append(_within_angle(row))
+    heads = ["trained on", "families not seen", "the same pairs, seen", "p", "modelnet40"]
+    lines = [markdown_row(heads), "|" + "---|" * len(heads)]
+    for shapes, by_kind in hits.items():
+        unseen = np.concatenate(by_kind["unseen"])
+        seen = np.concatenate(by_kind["seen"][::-1])  # the groups in the order of `unseen`
+        other = np.concatenate(by_kind["modelnet40"]) if "modelnet40" in by_kind else None
+        cells = [f"{h.mean():.1%} ({_wilson(h)})" for h in (unseen, seen)]
+        p = f"{_mcnemar(seen, unseen):.2g}"
+        cells += [p, "" if other is None else f"{other.mean():.1%} ({_wilson(other)})"]
+        lines.append(markdown_row([shapes, *cells]))
+    return "\n".join(lines)
+
+
 def choice_table(results: Path) -> str:
     """Build the table of weights that were tried for the choice among candidates."""
     path = results / "register" / "choice.json"

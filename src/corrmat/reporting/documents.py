@@ -23,6 +23,7 @@ from corrmat.reporting.comparisons import (
     confidence_table,
     doubling_summary,
     draw_training,
+    families_table,
     networks_table,
 )
 from corrmat.reporting.intervals import Estimate, as_text
@@ -225,6 +226,7 @@ TABLES: tuple[tuple[str, str, Callable[[Results], str]], ...] = (
     ("docs/register.md", "comparison", lambda results: comparison_table(results.folder)),
     ("docs/register.md", "choice", lambda results: choice_table(results.folder)),
     ("docs/register.md", "networks", lambda results: networks_table(results.folder)),
+    ("docs/register.md", "families", lambda results: families_table(results.folder)),
     ("docs/register.md", "doubling", lambda results: doubling_summary(results.folder)),
     ("docs/register.md", "confidence", lambda results: confidence_table(results.folder)),
     ("docs/speed.md", "bench", lambda results: bench_table(results.folder)),
