@@ -30,6 +30,7 @@ from corrmat.registration.hypotheses import Hypotheses, NetworkHypotheses
 from corrmat.registration.register import (
     COHERENCE_WEIGHT,
     SUPPORT_WEIGHT,
+    choose,
     measure_candidates,
     prepare_clouds,
     to_original_units,
@@ -76,7 +77,7 @@ def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> Pair
     truth = rigid.to_homogeneous(rotation, scale * (rotation @ x.centre + translation - y.centre))
     hypotheses = hypotheses._replace(transforms=np.stack([*hypotheses.transforms, truth]))
     transforms, measures = measure_candidates(hypotheses, subsamples, scorer)
-    chosen = transforms[int(np.argmax(measures[:-1] @ [1, *IN_USE]))]
+    chosen = transforms[choose(measures[:-1], IN_USE)]
 
     def errors_of(transforms: Sequence[np.ndarray]) -> np.ndarray:
         in_units = [to_original_units(t, scale, x.centre, y.centre) for t in transforms]
@@ -112,7 +113,7 @@ def recalls(tables: Sequence[np.ndarray], weights: tuple[float, float] | None) -
     """Compute the recall of choosing by weights; of the best candidate of each pair if None."""
     chosen = []
     for table in tables:
-        best = slice(None) if weights is None else [np.argmax(table[:, :3] @ [1, *weights])]
+        best = slice(None) if weights is None else [choose(table[:, :3], weights)]
         chosen.append(table[best, 3:].min(0))
     return shares(chosen)
 

@@ -39,7 +39,7 @@ def ransac(source: np.ndarray, target: np.ndarray, voxel: float) -> np.ndarray:
 
 def kiss(source: np.ndarray, target: np.ndarray, voxel: float) -> np.ndarray:
     """Run KISS-Matcher with its defaults."""
-    return kiss_matcher(source, target, 0, KissSettings(voxel), voxel_sampling=True)
+    return kiss_matcher(source, target, KissSettings(voxel), voxel_sampling=True)
 
 
 PIPELINES: dict[str, Callable[[np.ndarray, np.ndarray, float], np.ndarray]] = {

@@ -22,6 +22,7 @@ from corrmat.errors import CorrmatError
 from corrmat.registration import example
 from corrmat.registration import register as registration
 from corrmat.registration.hypotheses import rough_agreement
+from corrmat.registration.scene import build_scene, extent
 from corrmat.registration.scoring import AlignmentScorer
 from corrmat.registration.view import registration_page
 from corrmat.types import Prediction
@@ -120,6 +121,52 @@ def test_a_stray_point_far_away_changes_nothing(pair, far):
     assert (result.matches == without.matches + [1, 0]).all()
 
 
+def test_points_that_are_there_more_than_once_change_nothing(pair):
+    """Copies have no distance, and made every spacing and tolerance vanish."""
+    _, source, target, _ = pair
+    without = corrmat.register(source, target)
+    result = corrmat.register(np.repeat(source, 3, 0), np.vstack([target, target]))
+    assert (result.transform == without.transform).all()
+    assert result.overlap == without.overlap
+
+
+def test_seeds_may_be_numpys_and_must_be_integers(pair):
+    _, source, target, _ = pair
+    results = [corrmat.register(source, target, seed=seed) for seed in (3, np.int64(3))]
+    assert (results[0].transform == results[1].transform).all()
+    with pytest.raises(TypeError):
+        corrmat.register(source, target, seed=1.5)  # pyright: ignore[reportArgumentType]
+
+
+def test_the_default_precision_does_not_matter(pair):
+    _, source, target, _ = pair
+    expected = corrmat.register(source, target)
+    torch.set_default_dtype(torch.float64)
+    try:
+        result = corrmat.register(source, target)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    np.testing.assert_allclose(result.transform, expected.transform, atol=1e-6, rtol=1e-6)
+
+
+@pytest.mark.parametrize("model", ["icp", "corrmat"])
+def test_shapes_that_have_nothing_in_common_are_not_called_aligned(pair, model):
+    rng = np.random.default_rng(0)
+    noise = rng.normal(size=(600, 3)) * np.std(pair[1])
+    assert corrmat.register(noise, pair[2], model=model).verdict.startswith("doubtful")
+
+
+def test_a_stray_point_does_not_shrink_the_picture(pair):
+    _, source, target, _ = pair
+    stray = np.vstack([source, [[1e6, 0, 0]]])
+    result = corrmat.register(stray, target)
+    scene = build_scene(result, stray, target, 10)
+    assert scene.beside < 3 * np.ptp(target, axis=0).max()
+    assert np.isnan(scene.aligned).any(1).tolist() == [False] * len(source) + [True]
+    low, high = extent(scene.source_at(0.5))
+    assert (high - low).max() < 3 * np.ptp(target, axis=0).max()
+
+
 def registration_rotation(rng):
     q, r = np.linalg.qr(rng.normal(size=(3, 3)))
     q = q * np.sign(np.diag(r))
@@ -142,9 +189,12 @@ LINE = np.arange(50.0)[:, None] * np.array([1.0, 2.0, 3.0])
         (LINE, "all points lie on one line; the rotation is not determined"),
         (LINE + 1e6, "all points lie on one line; the rotation is not determined"),
         (GRID[:, :2], r"array of shape \(64, 2\)"),
-        (np.vstack([np.zeros((99, 3)), GRID - 1.5]), "most points are equal"),
+        (np.vstack([GRID[:2]] * 9), "2 different points; the rotation is not determined"),
         (np.array([[0, 0, 0], [1, 0, 0], [0, 1e3, 0]]), "2 points are left without the stray ones"),
         (np.hstack([GRID, 255 * GRID]), "no unit normals .one has length 1.33e.03"),
+        (np.hstack([GRID, 0 * GRID]), "no unit normals .one has length 0"),
+        ([[0.0, 1.0], [2.0]], "not an array of numbers"),
+        (torch.ones(9, 3, requires_grad=True), "not an array of numbers"),
     ],
 )
 def test_clouds_that_determine_nothing_are_refused(cloud, message):

@@ -89,6 +89,20 @@ def test_an_array_that_lies_on_its_side_is_not_three_points(tmp_path):
         read_scan(tmp_path / "side.npy")
 
 
+def test_three_points_with_normals_are_three_points(tmp_path):
+    np.save(tmp_path / "three.npy", np.hstack([POINTS[:3], POINTS[:3]]))
+    assert read_scan(tmp_path / "three.npy").tolist() == POINTS[:3].tolist()
+
+
+def test_pixels_of_a_pcd_without_a_measurement_are_left_out(tmp_path):
+    rows = [f"{x} {y} {z}" for x, y, z in POINTS[:4]]
+    head = ["VERSION .7", "FIELDS x y z", "SIZE 4 4 4", "TYPE F F F", "COUNT 1 1 1", "WIDTH 6"]
+    head += ["HEIGHT 1", "VIEWPOINT 0 0 0 1 0 0 0", "POINTS 6", "DATA ascii"]
+    text = "\n".join([*head, "nan nan nan", *rows, "nan nan nan", ""])
+    (tmp_path / "depth.pcd").write_text(text)
+    np.testing.assert_allclose(read_scan(tmp_path / "depth.pcd"), POINTS[:4], rtol=1e-6)
+
+
 def test_a_ply_keeps_millimetres_at_ten_thousand_kilometres(tmp_path):
     far = POINTS + 1e7
     write_ply(tmp_path / "far.ply", far)

@@ -84,9 +84,8 @@ def test_a_shape_gives_one_held_out_pair_at_most():
 def test_the_calibration_finds_the_chance_that_made_the_pairs():
     generator = torch.Generator().manual_seed(0)
     agreement, support = torch.rand(2, 4000, generator=generator, dtype=torch.float64)
-    ones = torch.ones(4000, dtype=torch.float64)
     logit = 6 * agreement + 3 * support - 4
     right = (torch.rand(4000, generator=generator) < torch.sigmoid(logit)).double()
-    x = torch.stack([agreement, support, ones], 1).numpy()
-    fitted = torch.tensor(shipping._fit_logistic(x, right.numpy()))
+    scores = torch.stack([agreement, support], 1).numpy()
+    fitted = torch.tensor(shipping._fit_logistic(scores, right.numpy()))
     torch.testing.assert_close(fitted, torch.tensor([6.0, 3.0, -4.0]), rtol=0.15, atol=0)

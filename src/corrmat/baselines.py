@@ -163,7 +163,6 @@ KISS = KissSettings(voxel_size=0.17)
 def kiss_matcher(
     source: np.ndarray,
     target: np.ndarray,
-    seed: int,
     settings: KissSettings = KISS,
     *,
     voxel_sampling: bool = False,

@@ -240,7 +240,10 @@ def _register(options: Namespace) -> int:
     """Register one file, or several, onto another."""
     several = len(options.source) > 1
     files = [options.json, options.html, options.gif, None if several else options.output]
+    written = [path.resolve() for path in filter(None, files)]
     for path in filter(None, files):
+        if written.count(path.resolve()) > 1:
+            raise CorrmatError(f"{path} is named for two results, and one would be lost")
         if path.is_dir():
             raise CorrmatError(f"{path} is a folder, not a file to write")
         if not path.parent.is_dir():

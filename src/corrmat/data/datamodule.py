@@ -125,8 +125,8 @@ class RegistrationDataModule(L.LightningDataModule):
         categories: only these; all by default.
         train_shapes: only the first so many training shapes (a tenth of them held out).
         test_shapes: only the first so many test shapes.
-        num_workers: processes that make pairs; 0 makes them in the training process, at a
-            fraction of a millisecond each.
+        num_workers: processes that make pairs; 0 makes them in the training process. A pair
+            takes a fraction of a millisecond; with new shapes or views, tens.
         seed: of the pairs and of the held-out shapes.
         new_shapes: train on new shapes in every epoch, of the categories of the training shapes:
             only for "shapes" and "assemblies". No training shape of the data set is then trained

@@ -50,7 +50,7 @@ def read_scan(path: str | Path, seed: int = 0) -> np.ndarray:
         points = reader(path, seed)
         if points.ndim != 2 or points.shape[1] < 3:
             raise CorrmatError(f"{path} holds an array of shape {points.shape}, not points (N, 3)")
-        if len(points) == 3 < points.shape[1]:
+        if len(points) == 3 and points.shape[1] > 6:
             raise CorrmatError(
                 f"{path} holds an array of shape {points.shape}: transpose it to (N, 3)"
             )
@@ -145,10 +145,11 @@ def _ply(path: Path, seed: int) -> np.ndarray:
 
 
 def _pcd(path: Path, seed: int) -> np.ndarray:
+    """Read the points of a PCD file; pixels without a measurement, which are NaN, are left out."""
     from pypcd4.pypcd4 import PointCloud
 
-    cloud = PointCloud.from_path(path)
-    return cloud.numpy(("x", "y", "z"))
+    points = PointCloud.from_path(path).numpy(("x", "y", "z"))
+    return points[~np.isnan(points).any(1)]
 
 
 def _numpy(path: Path, seed: int) -> np.ndarray:

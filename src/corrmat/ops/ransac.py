@@ -125,5 +125,4 @@ def best_distinct(rotation: Tensor, score: Tensor, count: int) -> Tensor:
         selected.append(best)
         cosine = ((rotation[candidates] * rotation[best]).sum((1, 2)) - 1) / 2
         candidates = candidates[cosine < _SAME_ROTATION]
-        candidates = candidates[candidates != best]
     return torch.stack(selected) if selected else score.new_empty(0, dtype=torch.int64)

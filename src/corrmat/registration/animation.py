@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from corrmat.registration.register import Registration
-from corrmat.registration.scene import build_scene
+from corrmat.registration.register import Registration, is_near
+from corrmat.registration.scene import build_scene, extent
 from corrmat.reporting.figures import BLUE, GREEN, GREY, RED, principal_axes
 from corrmat.reporting.snapshots import thin
 
@@ -44,7 +44,7 @@ def _frames(
     registration: Registration, source: np.ndarray, target: np.ndarray
 ) -> Iterator[Image.Image]:
     """Draw frame by frame, seen so that the target is as wide as it can be."""
-    axes_of_view = principal_axes(target[:, :3])
+    axes_of_view = principal_axes(target[is_near(target[:, :3]), :3])
     scene = build_scene(registration, source, target, MAX_LINES, axes_of_view)
     fixed, (i, j) = scene.fixed, scene.matches.T
     count = BEFORE + MATCHES + MOVING + AFTER
@@ -56,7 +56,7 @@ def _frames(
     cameras = [_camera(TURN_DEG * (share - 0.5)).T for share in np.linspace(0, 1, count)]
     corners = np.vstack([scene.source_at(0), fixed, scene.aligned])
     corners = np.vstack([corners @ camera for camera in cameras])
-    (left_end, bottom), (right_end, top) = corners.min(0), corners.max(0)
+    (left_end, bottom), (right_end, top) = extent(corners)
     axes.set(xlim=(left_end, right_end), ylim=(bottom, top))
     clouds = [axes.scatter([], [], s=5, c=colour, linewidths=0) for colour in (BLUE, RED)]
     colours = list(np.where(scene.agrees, GREEN, GREY))

@@ -50,25 +50,26 @@ def em_icp(
     )
     planes = n_y.unsqueeze(2) * n_y.unsqueeze(1)
     on_planes = n_y * (n_y * y).sum(1, keepdim=True)
-    terms = torch.cat([torch.ones(len(y), 1), y, planes.flatten(1), on_planes], 1)
+    terms = torch.cat([y.new_ones(len(y), 1), y, planes.flatten(1), on_planes], 1)
+    identity = torch.eye(3, dtype=x.dtype)
     for width in np.geomspace(*_WIDTHS, _ITERATIONS).tolist():
         moved, normals = x @ rotation.T + translation, n_x @ rotation.T
         match = _closeness(moved, y, width).mul_((normals @ n_y.T).abs_()).mul_(prior)
         sums = _sums_over_matches(match, terms)
-        weight, sum_y, planes, on_planes = sums.split([1, 3, 9, 3], 1)
+        weight, sum_y, sum_planes, sum_on_planes = sums.split([1, 3, 9, 3], 1)
         apart = weight * moved - sum_y
         along = normals * (normals * apart).sum(1, keepdim=True)
-        planes = planes.unflatten(1, (3, 3))
+        sum_planes = sum_planes.unflatten(1, (3, 3))
         own_planes = weight.unsqueeze(2) * normals.unsqueeze(2) * normals.unsqueeze(1)
-        off_planes = (planes @ moved.unsqueeze(2)).squeeze(2) - on_planes + along
+        off_planes = (sum_planes @ moved.unsqueeze(2)).squeeze(2) - sum_on_planes + along
         step = _gauss_newton(
             moved,
             _PLANE * off_planes + (1 - _PLANE) * apart,
-            _PLANE * (planes + own_planes) + (1 - _PLANE) * weight.unsqueeze(2) * torch.eye(3),
+            _PLANE * (sum_planes + own_planes) + (1 - _PLANE) * weight.unsqueeze(2) * identity,
         )
         rotation, translation = rigid.compose(step, (rotation, translation))
-    u, _, v = torch.linalg.svd(rotation.double())
-    return rigid.to_homogeneous(u @ v, translation)
+    u, _, vh = torch.linalg.svd(rotation.double())
+    return rigid.to_homogeneous(u @ vh, translation)
 
 
 def _closeness(x: Tensor, y: Tensor, width: float) -> Tensor:
@@ -108,6 +109,6 @@ def _gauss_newton(points: Tensor, force: Tensor, stiffness: Tensor) -> tuple[Ten
     matrix = torch.cat([torch.cat([both, turned], 1), torch.cat([turned.T, stiffness.sum(0)], 1)])
     vector = torch.cat([torch.linalg.cross(points, force).sum(0), force.sum(0)])
     # Without any match there is nothing to balance, and no step.
-    matrix = matrix.double() + 1e-6 * torch.eye(6)
+    matrix = matrix.double() + 1e-6 * torch.eye(6, dtype=torch.float64)
     turn, shift = -torch.linalg.solve(matrix, vector.double()).float().view(2, 3)
     return rigid.axis_angle_to_matrix(F.normalize(turn, dim=0), turn.norm()), shift

@@ -123,11 +123,11 @@ class NetworkHypotheses:
         least = int(getattr(self.network, "min_points", 3))
         if min(x.shape[1], y.shape[1]) < least:
             raise CorrmatError(f"this network needs clouds of at least {least} points")
-        device = next((p.device for p in self.network.parameters()), x.device)
+        own = next(self.network.parameters(), x)  # where and in which precision it computes
         modes = [(module, module.training) for module in self.network.modules()]
         self.network.eval()
         try:
-            prediction = self.network(x.to(device), y.to(device))
+            prediction = self.network(x.to(own), y.to(own))
         finally:
             for module, mode in modes:
                 module.training = mode
@@ -190,7 +190,7 @@ def kiss(
     source: np.ndarray, target: np.ndarray, seed: int, settings: KissSettings = KISS
 ) -> Hypotheses:
     """Return the one hypothesis of KISS-Matcher."""
-    return Hypotheses(kiss_matcher(source, target, seed, settings)[None], *_NO_MATCHES)
+    return Hypotheses(kiss_matcher(source, target, settings)[None], *_NO_MATCHES)
 
 
 def ransac17(

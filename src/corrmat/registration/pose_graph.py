@@ -22,7 +22,7 @@ _SWEEPS = 50  # of averaging; poses settle within ten
 _ANGLE_DEG, _SHARE = 10.0, 0.2
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ScanPose:
     """The pose of one of several scans."""
 

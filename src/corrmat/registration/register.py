@@ -2,6 +2,7 @@
 
 import functools
 import json
+import operator
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,12 +31,12 @@ FULL_POINTS = 20_000  # to refine the selected one
 # A candidate scores agreement + these times coherence and support; see benchmarks/choice.py.
 COHERENCE_WEIGHT, SUPPORT_WEIGHT = 1.5, 0.4
 MEDIAN = 0.6  # median distance from the centroid after scaling: a radius of about one
-MAX_NORMAL = 1.01  # longest given normal
+NORMAL_TOLERANCE = 0.01  # by which the length of a given normal may differ from one
 FAR = 30.0  # median distances from the middle: a point beyond is a stray one and left out
 _LINE = 1e-6  # a cloud that is thinner, relative to its length, is a line
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Registration:
     """The rigid transform that takes a source onto a target, and how far to trust it."""
 
@@ -92,6 +93,7 @@ def register(
     """
     if refine not in ("icp", "none"):
         raise CorrmatError(f"refine = {refine!r}; choices: icp, none")
+    seed = operator.index(seed)  # an integer of NumPy is one too
     if not 0 <= seed < 2**63:
         raise CorrmatError(f"seed = {seed} is not between 0 and 2^63")
     if isinstance(model, nn.Module):
@@ -106,7 +108,7 @@ def register(
     (x, y), scale, subsamples, scorer = prepare_clouds(source, target, seed)
     hypotheses = generate(*subsamples, seed)
     transforms, measures = measure_candidates(hypotheses, subsamples, scorer, refine)
-    transform = transforms[np.argmax(measures @ [1.0, COHERENCE_WEIGHT, SUPPORT_WEIGHT])]
+    transform = transforms[choose(measures)]
     full = scorer
     if max(len(x.rows), len(y.rows)) > SELECTION_POINTS:
         full = AlignmentScorer(x.points(scale, FULL_POINTS), y.points(scale, FULL_POINTS))
@@ -179,6 +181,18 @@ def measure_candidates(
     return transforms, np.array(measures)
 
 
+def choose(
+    measures: np.ndarray, weights: tuple[float, float] = (COHERENCE_WEIGHT, SUPPORT_WEIGHT)
+) -> int:
+    """Return the candidate of the highest score.
+
+    Args:
+        measures: (T, 3) of `measure_candidates`.
+        weights: of coherence and support, beside agreement's 1.
+    """
+    return int(np.argmax(measures @ [1.0, *weights]))
+
+
 def refine_chosen(
     transform: np.ndarray,
     hypotheses: Hypotheses,
@@ -223,7 +237,10 @@ class Cloud:
         """
         if isinstance(cloud, str | Path):
             raise CorrmatError(f"{name}: points are needed; corrmat.read_scan reads a file")
-        values = np.asarray(cloud, np.float64)
+        try:
+            values = np.asarray(cloud, np.float64)
+        except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError is torch's
+            raise CorrmatError(f"{name}: not an array of numbers ({error})") from error
         if values.ndim != 2 or values.shape[1] not in (3, 6):
             raise CorrmatError(f"{name}: array of shape {values.shape}, not (N, 3) or (N, 6)")
         if len(values) < 3:
@@ -233,17 +250,19 @@ class Cloud:
             raise CorrmatError(
                 f"{name}: {len(bad)} points are NaN or infinite, the first is row {bad[0]}"
             )
-        longest = np.linalg.norm(values[:, 3:], axis=1).max(initial=0)
-        if longest > MAX_NORMAL:
+        lengths = np.linalg.norm(values[:, 3:], axis=1)
+        if values.shape[1] > 3 and np.abs(lengths - 1).max() > NORMAL_TOLERANCE:
+            worst = lengths[np.abs(lengths - 1).argmax()]
             raise CorrmatError(
-                f"{name}: columns 4 to 6 are no unit normals (one has length {longest:.3g}); pass "
+                f"{name}: columns 4 to 6 are no unit normals (one has length {worst:.3g}); pass "
                 "the points alone, (N, 3), and normals are estimated"
             )
-        rank = _hash(values, seed)
-        size = min(FULL_POINTS, len(rank))
-        few = np.argpartition(rank, size)[:size] if len(rank) > size else np.arange(size)
-        rows = few[np.argsort(rank[few])]
-        rows = rows[_is_near(values[rows, :3], name)]
+        # A point that is there more than once counts once: its copies would shrink the spacing.
+        rows = np.unique(_hash(values[:, :3], seed), return_index=True)[1][:FULL_POINTS]
+        if len(rows) < 3:
+            many = f"{len(rows)} different points" if len(rows) > 1 else "all points are equal"
+            raise CorrmatError(f"{name}: {many}; the rotation is not determined")
+        rows = rows[is_near(values[rows, :3], name)]
         if len(rows) < 3:
             raise CorrmatError(f"{name}: {len(rows)} points are left without the stray ones")
         checked = cls(rows, values[rows])
@@ -255,8 +274,6 @@ class Cloud:
             raise CorrmatError(
                 f"{name}: all points lie on one line; the rotation is not determined"
             )
-        if not checked.median:
-            raise CorrmatError(f"{name}: most points are equal; there is no shape to register")
         return checked
 
     def points(self, scale: float, count: int) -> np.ndarray:
@@ -270,7 +287,7 @@ class Cloud:
         return np.hstack([points, given if given.shape[1] else estimate_normals(points)])
 
 
-def _is_near(points: np.ndarray, name: str) -> np.ndarray:
+def is_near(points: np.ndarray, name: str = "cloud") -> np.ndarray:
     """Tell which points (N, 3) are no stray ones: (N,) bool.
 
     Raises:
@@ -281,7 +298,7 @@ def _is_near(points: np.ndarray, name: str) -> np.ndarray:
     typical = np.median(distance)
     if not np.isfinite(typical):
         raise CorrmatError(f"{name}: coordinates are too large to compute distances")
-    # Where most points are equal there is no measure; that is refused elsewhere.
+    # Where most points are equal there is no measure.
     return distance <= FAR * typical if typical else np.ones(len(points), bool)
 
 
@@ -294,11 +311,6 @@ def _hash(values: np.ndarray, seed: int) -> np.ndarray:
         state = (state ^ state >> np.uint64(27)) * np.uint64(0x94D049BB133111EB)
         state ^= state >> np.uint64(31)
     return state
-
-
-@functools.cache
-def _calibration() -> Calibration:
-    return shipped_calibration()
 
 
 def _load_network(model: str) -> NetworkHypotheses:
@@ -318,6 +330,11 @@ def _load_network(model: str) -> NetworkHypotheses:
         if path.exists() or model.startswith("hf:"):
             raise
         raise CorrmatError(f"{error}; classical pipelines: {', '.join(CLASSICAL)}") from error
+
+
+@functools.cache
+def _calibration() -> Calibration:
+    return shipped_calibration()
 
 
 @functools.lru_cache(maxsize=4)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from corrmat.registration.register import Registration
+from corrmat.registration.register import Registration, is_near
 
 BESIDE = 0.6  # of both clouds' largest extents: how far the source starts from the target
 
@@ -14,7 +14,8 @@ BESIDE = 0.6  # of both clouds' largest extents: how far the source starts from 
 class Scene:
     """A registration in the target's frame, about the target's centroid.
 
-    Far from the origin a browser's float32 would lose the detail.
+    Far from the origin a browser's float32 would lose the detail. Stray points, which `register`
+    leaves out, are NaN: no program draws them, and they do not count for the extents.
     """
 
     fixed: np.ndarray  # (M, 3) the target
@@ -26,9 +27,19 @@ class Scene:
 
     def source_at(self, progress: float) -> np.ndarray:
         """Return the source (N, 3): as given, beside the target (0), to aligned (1)."""
-        left, middle = 1 - progress, self.aligned.mean(0)
+        left, middle = 1 - progress, np.nanmean(self.aligned, 0)
         rotation = Rotation.from_rotvec(left * self.rotvec).as_matrix()
         return (self.aligned - middle) @ rotation.T + middle - [left * self.beside, 0, 0]
+
+
+def extent(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and highest coordinates, (3,) each, of points (N, 3) that are not NaN."""
+    return np.nanmin(points, 0), np.nanmax(points, 0)
+
+
+def _largest_extent(points: np.ndarray) -> float:
+    low, high = extent(points)
+    return float((high - low).max())
 
 
 def build_scene(
@@ -48,16 +59,19 @@ def build_scene(
         axes: (3, 3), the columns are axes of the scene; those of the target's frame if None.
     """
     axes = np.eye(3) if axes is None else axes
-    origin = target[:, :3].mean(0)
+    source, target = (
+        np.where(is_near(cloud[:, :3])[:, None], cloud[:, :3], np.nan) for cloud in (source, target)
+    )
+    origin = np.nanmean(target, 0)
     rotation, translation = registration.transform[:3, :3], registration.transform[:3, 3]
-    fixed = (target[:, :3] - origin) @ axes
-    aligned = (source[:, :3] @ rotation.T + translation - origin) @ axes
+    fixed = (target - origin) @ axes
+    aligned = (source @ rotation.T + translation - origin) @ axes
     strongest = np.argsort(-registration.match_confidence, kind="stable")[:max_matches]
     return Scene(
         fixed,
         aligned,
         rotvec=Rotation.from_matrix(axes.T @ rotation.T @ axes).as_rotvec(),
-        beside=BESIDE * float(np.ptp(fixed, axis=0).max() + np.ptp(aligned, axis=0).max()),
+        beside=BESIDE * (_largest_extent(fixed) + _largest_extent(aligned)),
         matches=registration.matches[strongest],
         agrees=registration.match_agrees[strongest],
     )

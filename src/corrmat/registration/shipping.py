@@ -68,7 +68,9 @@ def add_training(results: Path, run: dict[str, object]) -> None:
 def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:
     """Fit the chance that a pair is aligned to its agreement and support.
 
-    Logistic regression on held-out pairs of three difficulties; `Calibration` applies it.
+    Logistic regression on held-out pairs of three difficulties; `Calibration` applies it. The curve
+    over the agreement alone, for models without matches, is fitted on ICP's outcomes as well: most
+    of them are wrong, where few of the network's are.
 
     Args:
         model: as `register` takes it.
@@ -78,15 +80,25 @@ def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:
         protocol's pairs of 512 points that are within 5 degrees.
     """
     scores, aligned, recalls = [], [], {}
+    agreements, aligned_alone = [], []
     for protocol, points in itertools.product(CALIBRATION_PROTOCOLS, CALIBRATION_PAIRS):
         pairs = held_out_pairs(protocol, CALIBRATION_PAIRS[points], seed=0, points=points)
-        result = benchmark.compare(pairs, [model])[model]
-        recalls.setdefault(protocol, result.recall_5deg)
-        scores += zip(result.per_pair["agreement"], result.per_pair["support"], strict=True)
-        aligned += [distance < ADDS_THRESHOLD for distance in result.per_pair["adds"]]
-    x = np.column_stack([np.array(scores), np.ones(len(scores))])
-    y = np.array(aligned, float)
-    return {"both": _fit_logistic(x, y), "agreement": _fit_logistic(x[:, [0, 2]], y)}, recalls
+        results = benchmark.compare(pairs, [model, "icp"])
+        per_pair = results[model].per_pair
+        recalls.setdefault(protocol, results[model].recall_5deg)
+        scores += zip(per_pair["agreement"], per_pair["support"], strict=True)
+        aligned += _aligned(per_pair)
+        for result in results.values():
+            agreements += result.per_pair["agreement"]
+            aligned_alone += _aligned(result.per_pair)
+    both = _fit_logistic(np.array(scores), np.array(aligned, float))
+    alone = _fit_logistic(np.array(agreements)[:, None], np.array(aligned_alone, float))
+    return {"both": both, "agreement": alone}, recalls
+
+
+def _aligned(per_pair: Mapping[str, list[float]]) -> list[bool]:
+    """Tell which of a model's pairs lie on each other."""
+    return [distance < ADDS_THRESHOLD for distance in per_pair["adds"]]
 
 
 def held_out_pairs(
@@ -109,8 +121,13 @@ def held_out_pairs(
     return make_pairs(clouds, chosen, keys, settings)
 
 
-def _fit_logistic(x: np.ndarray, y: np.ndarray) -> list[float]:
-    """Fit the coefficients of a logistic curve, with slight shrinkage for separable classes."""
+def _fit_logistic(scores: np.ndarray, y: np.ndarray) -> list[float]:
+    """Fit a logistic curve over scores (n, k), with slight shrinkage for separable classes.
+
+    Returns:
+        k coefficients and the constant.
+    """
+    x = np.column_stack([scores, np.ones(len(scores))])
 
     def loss(coefficients: np.ndarray) -> float:
         logit = x @ coefficients

@@ -6,7 +6,7 @@ import numpy as np
 import plotly.graph_objects as go
 
 from corrmat.registration.register import Registration
-from corrmat.registration.scene import build_scene
+from corrmat.registration.scene import build_scene, extent
 from corrmat.reporting.figures import BLUE, GREEN, GREY, RED
 from corrmat.reporting.html import render
 from corrmat.reporting.snapshots import thin
@@ -34,7 +34,7 @@ def registration_page(registration: Registration, source: np.ndarray, target: np
     everything = np.vstack([fixed, aligned, scene.source_at(0)])
     axes = {
         f"{axis}axis": {"visible": False, "range": [low, high]}  # the same all along the way
-        for axis, low, high in zip("xyz", everything.min(0), everything.max(0), strict=True)
+        for axis, low, high in zip("xyz", *extent(everything), strict=True)
     }
     figure.update_layout(
         template="none",
@@ -44,7 +44,7 @@ def registration_page(registration: Registration, source: np.ndarray, target: np
         scene={**axes, "aspectmode": "data", "camera": {"eye": {"x": 0.3, "y": -1.4, "z": 0.7}}},
     )
     motion = {
-        "middle": aligned.mean(0).tolist(),
+        "middle": np.nanmean(aligned, 0).tolist(),
         "turn": scene.rotvec.tolist(),
         "beside": scene.beside,
     }

@@ -164,7 +164,7 @@ def headline(evidence: Evidence) -> list[str]:
 
 
 def sooner(evidence: Evidence) -> Claim | None:
-    """METHOD_corr reaches METHOD's final error after fewer pairs."""
+    """METHOD_corr reaches METHOD's best error after fewer pairs."""
     record, name = evidence.record, "rotation_error_deg_mean"
     baseline, treatment = (record.arms[arm] for arm in record.compared)
     if not (baseline.curve and treatment.curve):
