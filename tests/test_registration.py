@@ -288,6 +288,7 @@ def test_the_command_writes_what_it_promises(pair, tmp_path, capsys):
         (["a.ply", "a.ply", "--model", "a.ply"], "a.ply is no checkpoint"),
         (["a.ply", "a.ply", "--model", "a.stl"], "a.stl is no checkpoint"),
         (["a.ply", "two.xyz"], "target: 2 points"),
+        (["a.ply", "a.ply", "--json", "x", "--html", "./x"], "x is named for two results"),
     ],
 )
 def test_bad_input_is_one_line_and_code_2(words, message, tmp_path, monkeypatch, capsys):
