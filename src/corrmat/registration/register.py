@@ -257,8 +257,10 @@ class Cloud:
                 f"{name}: columns 4 to 6 are no unit normals (one has length {worst:.3g}); pass "
                 "the points alone, (N, 3), and normals are estimated"
             )
+        order = np.argsort(_hash(values, seed))
         # A point that is there more than once counts once: its copies would shrink the spacing.
-        rows = np.unique(_hash(values[:, :3], seed), return_index=True)[1][:FULL_POINTS]
+        different = np.unique(_hash(values[order, :3], seed), return_index=True)[1]
+        rows = order[np.sort(different)][:FULL_POINTS]
         if len(rows) < 3:
             many = f"{len(rows)} different points" if len(rows) > 1 else "all points are equal"
             raise CorrmatError(f"{name}: {many}; the rotation is not determined")
