@@ -16,6 +16,7 @@ from PIL import Image
 import corrmat
 from corrmat.calibration import verdict
 from corrmat.cli import main
+from corrmat.data.normals import estimate_normals
 from corrmat.data.scans import read_scan, write_ply
 from corrmat.data.shapes.dataset import make_shape
 from corrmat.errors import CorrmatError
@@ -128,6 +129,15 @@ def test_points_that_are_there_more_than_once_change_nothing(pair):
     result = corrmat.register(np.repeat(source, 3, 0), np.vstack([target, target]))
     assert (result.transform == without.transform).all()
     assert result.overlap == without.overlap
+
+
+def test_copies_may_differ_in_their_normals(pair):
+    _, source, target, _ = pair
+    clouds = [np.hstack([c, estimate_normals(c)]) for c in (source, target)]
+    without = corrmat.register(*clouds)
+    flipped = clouds[0] * [1, 1, 1, -1, -1, -1]
+    result = corrmat.register(np.vstack([clouds[0], flipped]), clouds[1])
+    assert result.overlap > 0.9 * without.overlap
 
 
 def test_seeds_may_be_numpys_and_must_be_integers(pair):

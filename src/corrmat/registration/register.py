@@ -257,10 +257,12 @@ class Cloud:
                 f"{name}: columns 4 to 6 are no unit normals (one has length {worst:.3g}); pass "
                 "the points alone, (N, 3), and normals are estimated"
             )
-        order = np.argsort(_hash(values, seed))
         # A point that is there more than once counts once: its copies would shrink the spacing.
-        different = np.unique(_hash(values[order, :3], seed), return_index=True)[1]
-        rows = order[np.sort(different)][:FULL_POINTS]
+        rows = np.unique(_hash(values, seed), return_index=True)[1]
+        if values.shape[1] > 3:  # copies may differ in their normals
+            first = np.unique(_hash(values[rows, :3], seed), return_index=True)[1]
+            rows = rows[np.sort(first)]
+        rows = rows[:FULL_POINTS]
         if len(rows) < 3:
             many = f"{len(rows)} different points" if len(rows) > 1 else "all points are equal"
             raise CorrmatError(f"{name}: {many}; the rotation is not determined")
