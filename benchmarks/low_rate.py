@@ -15,16 +15,16 @@ import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 
-import torch
-
+from corrmat.files import replace_text
 from corrmat.reporting.intervals import (
-    PairErrors,
     match_accuracy,
     median_rotation,
     p_of_equal_errors,
+    pair_errors,
     ratio_of_medians,
     read_errors,
 )
+from corrmat.reporting.writer import pair_rows
 from corrmat.training.console import Board
 from corrmat.training.experiment import train_or_reuse
 from corrmat.training.fit import load_trained, score
@@ -34,13 +34,6 @@ from corrmat.training.recipe import load
 ROOT = Path(__file__).resolve().parents[1]
 PATH = ROOT / "results" / "low_rate.json"
 ARM = "RPMNet_corr"
-
-
-def errors_of(tested: dict[str, torch.Tensor]) -> PairErrors:
-    """Read the errors of the test pairs, as a record's per_pair.csv has them."""
-    columns = [tested[name].double().numpy() for name in ("num_correct", "num_matchable")]
-    degrees = tested["rotation_error_deg"].double().nan_to_num(180.0).numpy()
-    return PairErrors(degrees, *columns, torch.zeros(len(degrees), dtype=torch.int64).numpy())
 
 
 def main(scale: str, data: str, root: str | None = None) -> None:
@@ -60,7 +53,7 @@ def main(scale: str, data: str, root: str | None = None) -> None:
     with Board() as board:
         trained = train_or_reuse(place, arm, ROOT / "runs", "csv", board)
     record = read_errors(ROOT / "results" / recipe.place / "per_pair.csv")
-    tested = errors_of(score(load_trained(arm, trained.checkpoint), arm)[0])
+    tested = pair_errors(pair_rows(ARM, score(load_trained(arm, trained.checkpoint), arm)))
     rows = {f"RPMNet, steady {low.lr:g}": record["RPMNet"], f"{ARM}, steady {low.lr:g}": tested}
     for name in ("RPMNet_high_rate", ARM):
         peak = recipe.arms[name].optimizer.lr
@@ -79,7 +72,7 @@ def main(scale: str, data: str, root: str | None = None) -> None:
         "ratio_at_the_low_rate": asdict(ratio_of_medians(record["RPMNet"], tested)),
         "p": p_of_equal_errors(record["RPMNet"], tested),
     }
-    PATH.write_text(json.dumps(content, indent=1) + "\n")
+    replace_text(PATH, json.dumps(content, indent=1) + "\n")
     print(json.dumps(content[f"{scale}, {data}"], indent=1))
 
 

@@ -3,7 +3,7 @@
 Plain ICP matches each point with the nearest one. Two scans share no point, so a flat or round
 part slides along itself until it lies where the nearest points happen to be. Here a point matches
 many points a little: by how near they are, how parallel their normals, and how probable the
-network finds the match. The network knows where on the part a point lies, and holds it there.
+network finds the match. The network has an idea where on the part a point lies.
 """
 
 import numpy as np

@@ -25,7 +25,7 @@ from corrmat.reporting.intervals import (
     read_errors,
 )
 from corrmat.reporting.record import Record
-from corrmat.reporting.tables import markdown_row, paper_metric, ratio_cell
+from corrmat.reporting.tables import markdown_head, markdown_row, paper_metric, ratio_cell
 
 Verdict = Literal["confirmed", "confirmed in direction", "not shown", "contradicted"]
 LEFT_BASELINE = 0.5  # of identity's median error: an arm above it has learnt nothing to compare
@@ -75,11 +75,12 @@ class Evidence:
         seed = f", seed {self.record.seed}" if self.record.seed else ""
         return f"{self.record.scale}, {self.record.data}{seed}"
 
-    @property
-    def times_the_pairs(self) -> float:
-        """How many of METHOD's training pairs METHOD_corr saw for each one; 1 if not recorded."""
-        baseline, treatment = (self.record.arms[arm].pairs_seen for arm in self.record.compared)
-        return treatment / baseline if baseline and treatment else 1.0
+    def times_the_pairs(self, opponent: str) -> float:
+        """Compute METHOD_corr's training pairs for each one of another arm; 1 if not recorded."""
+        theirs, ours = (
+            self.record.arms[arm].pairs_seen for arm in (opponent, self.record.treatment)
+        )
+        return ours / theirs if theirs and ours else 1.0
 
     def left_identity(self, errors: PairErrors) -> bool:
         """Tell whether an arm is clearly better than guessing the identity."""
@@ -132,14 +133,15 @@ def less_error(evidence: Evidence) -> Claim:
     if not learnt:
         identity = f"{evidence.identity_median_deg:g} deg"
         ours += f"; {record.baseline} errs by at least half of the identity guess's {identity}"
-    if evidence.times_the_pairs > FAIR_SHARE:
-        ours += f"; {record.treatment} saw {evidence.times_the_pairs:.3g} times as many pairs"
+    times = evidence.times_the_pairs(str(record.baseline))
+    if times > FAIR_SHARE:
+        ours += f"; {record.treatment} saw {times:.3g} times as many pairs"
     return Claim(
         f"{record.id}: {record.treatment} registers better than {record.baseline} ({record.title})",
         f"{theirs[0]:.3g} → {theirs[1]:.3g} deg: {paper_ratio:.3g} times" if paper_ratio else "",
         ours,
         evidence.where,
-        verdict_of_ratio(ratio, paper_ratio, learnt, evidence.times_the_pairs),
+        verdict_of_ratio(ratio, paper_ratio, learnt, times),
     )
 
 
@@ -251,7 +253,12 @@ def loss_not_rate(evidence: Evidence) -> Claim | None:
         f"{as_text(median_rotation(evidence.errors[control]), 'deg')} → "
         f"{as_text(median_rotation(evidence.treatment), 'deg')}: {as_text(ratio)} times",
         evidence.where,
-        verdict_of_ratio(ratio, None, evidence.left_identity(evidence.errors[control])),
+        verdict_of_ratio(
+            ratio,
+            None,
+            evidence.left_identity(evidence.errors[control]),
+            evidence.times_the_pairs(control),
+        ),  # fmt: skip
     )
 
 
@@ -403,7 +410,7 @@ def verdicts(record: Record, results: Path) -> str:
 def markdown_claims(claims: Sequence[Claim]) -> str:
     """Build the ledger as a Markdown table."""
     heads = ["claim", "paper", "ours", "record", "verdict"]
-    lines = [markdown_row(heads), "|" + "---|" * len(heads)]
+    lines = markdown_head(heads)
     lines += [markdown_row([c.words, c.paper, c.ours, c.where, f"**{c.verdict}**"]) for c in claims]
     return "\n".join(lines)
 

@@ -12,7 +12,7 @@ from scipy import stats
 from corrmat.calibration import shipped_calibration, verdict
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG
 from corrmat.reporting.figures import BLUE, GREEN, RED, save
-from corrmat.reporting.tables import markdown_row
+from corrmat.reporting.tables import markdown_head, markdown_row
 from corrmat.weights import shipped_metadata
 
 OURS = "corrmat"
@@ -28,7 +28,7 @@ def comparison_summary(results: Path, points: int = 512) -> str:
         return "No comparison is recorded; `make protocols` makes them."
     models = list(records[0]["models"])
     heads = ["pairs", "data", *models]
-    lines = [markdown_row(heads), "|" + "---|" * len(heads)]
+    lines = markdown_head(heads)
     for record in records:
         cells = []
         for model in models:
@@ -46,7 +46,7 @@ def comparison_table(results: Path) -> str:
     is within 5 degrees as often as ours, on the same pairs.
     """
     heads = ["pairs", "data", "points", "model", "within 5 deg", "ADD-S", "p", "ms a pair"]
-    lines = [markdown_row(heads), "|" + "---|" * len(heads)]
+    lines = markdown_head(heads)
     for record in _read_comparisons(results):
         ours = _within_angle(record["models"][OURS])
         for model, row in record["models"].items():
@@ -65,7 +65,7 @@ def networks_table(results: Path) -> str:
     if not path.is_file():
         return "No comparison is recorded."
     heads = ["network", "its record", "within 5 deg", "ADD-S", "p"]
-    lines = [markdown_row(heads), "|" + "---|" * len(heads)]
+    lines = markdown_head(heads)
     models = json.loads(path.read_text())["models"]
     ours = _within_angle(models[OURS])
     for name, row in models.items():
@@ -117,7 +117,7 @@ def choice_table(results: Path) -> str:
     record = json.loads(path.read_text())
     protocols = [name for name in _PROTOCOLS if name in record]
     heads = ["weights of coherence, support", *protocols]
-    lines = [markdown_row(heads), "|" + "---|" * len(heads)]
+    lines = markdown_head(heads)
     for weights in record[protocols[0]]["weights"]:
         tried = [record[name]["weights"][weights] for name in protocols]
         shares = [f"{row['recall_5deg']:.1%}, {row['recall_adds']:.1%}" for row in tried]

@@ -30,7 +30,13 @@ from corrmat.reporting.intervals import Estimate, as_text
 from corrmat.reporting.matrices import draw_matrices
 from corrmat.reporting.overview import draw_overview, longest_records
 from corrmat.reporting.record import Record, defined, read_records
-from corrmat.reporting.tables import cell, markdown_row, markdown_summary, markdown_tables
+from corrmat.reporting.tables import (
+    cell,
+    markdown_head,
+    markdown_row,
+    markdown_summary,
+    markdown_tables,
+)
 from corrmat.reporting.writer import draw_record
 from corrmat.weights import shipped_metadata, shipped_models
 
@@ -74,7 +80,7 @@ def headline_table(results: Results) -> str:
         "trained",
         "verdict",
     ]
-    lines = [markdown_row(heads), "|" + "---|" * len(heads)]
+    lines = markdown_head(heads)
     for record in longest_records(results.records):
         if record.id in HEADLINES:
             lines.append(markdown_row(headline(read_evidence(record, results.folder))))
@@ -85,7 +91,7 @@ def headline_table(results: Results) -> str:
 def rates_table(results: Path) -> str:
     """Build the table of the learning-rate sweeps: validation error by rate, the choice in bold."""
     heads = ["experiment", "arm", "pairs", "a third of it", "starting rate", "three times it"]
-    lines = [markdown_row(heads), "|" + "---|" * len(heads)]
+    lines = markdown_head(heads)
     for path in sorted(results.glob("rates/*/*/*.json")):
         sweep = json.loads(path.read_text())
         for arm, result in sweep["arms"].items():
@@ -102,7 +108,7 @@ def rates_table(results: Path) -> str:
 def slack_table(results: Path) -> str:
     """Build the table of RPMNet_corr in 2.2 with its own alpha and with alpha held."""
     heads = ["network", "alpha", "rotation error, deg", "translation error", "true match, %"]
-    lines = [markdown_row(heads), "|" + "---|" * len(heads)]
+    lines = markdown_head(heads)
     path = results / "slack.json"
     tests = json.loads(path.read_text()) if path.is_file() else {}
     for name, test in sorted(tests.items()):
@@ -117,7 +123,7 @@ def slack_table(results: Path) -> str:
 def low_rate_table(results: Path) -> str:
     """Build the table of RPMNet_corr at RPMNet's steady rate in 2.2, beside the record's arms."""
     heads = ["record", "pairs", "arm and rate", "median rotation error, deg", "correct matches"]
-    lines = [markdown_row(heads), "|" + "---|" * len(heads)]
+    lines = markdown_head(heads)
     path = results / "low_rate.json"
     tests = json.loads(path.read_text()) if path.is_file() else {}
     for name, test in sorted(tests.items()):
@@ -154,7 +160,7 @@ def seeds_table(results: Path) -> str:
         if record.scale != "smoke":
             groups[record.id, record.scale, record.data][record.seed] = record
     heads = ["experiment", "arm", "median rotation error by seed, deg", "correct matches, %"]
-    lines = [markdown_row(heads), "|" + "---|" * len(heads)]
+    lines = markdown_head(heads)
     for (identity, scale, data), by_seed in sorted(groups.items()):
         if len(by_seed) < 2:
             continue

@@ -5,7 +5,7 @@ Everything here is computed from a record's per_pair.csv, so it needs no network
 
 import csv
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -62,23 +62,26 @@ def as_text(estimate: Estimate, unit: str = "") -> str:
 
 def read_errors(path: Path) -> dict[str, PairErrors]:
     """Read a per_pair.csv: the errors of every arm and baseline."""
-    rows: dict[str, list[dict[str, str]]] = defaultdict(list)
+    rows: dict[str, list[Mapping[str, object]]] = defaultdict(list)
     with path.open(newline="") as file:
         for row in csv.DictReader(file):
             rows[row["arm"]].append(row)
 
-    def column(arm: str, name: str) -> np.ndarray:
-        return np.array([float(row[name] or "nan") for row in rows[arm]])
+    return {arm: pair_errors(its_rows) for arm, its_rows in rows.items()}
 
-    return {
-        arm: PairErrors(
-            np.nan_to_num(column(arm, "rotation_error_deg"), nan=180.0),
-            column(arm, "num_correct"),
-            column(arm, "num_matchable"),
-            column(arm, "band").astype(int),
-        )
-        for arm in rows
-    }
+
+def pair_errors(rows: Sequence[Mapping[str, object]]) -> PairErrors:
+    """Build the errors of one arm from its rows of per_pair.csv; see `writer.pair_rows`."""
+
+    def column(name: str) -> np.ndarray:
+        return np.array([float(str(row[name]) or "nan") for row in rows])
+
+    return PairErrors(
+        np.nan_to_num(column("rotation_error_deg"), nan=180.0),
+        column("num_correct"),
+        column("num_matchable"),
+        column("band").astype(int),
+    )
 
 
 def median_rotation(errors: PairErrors) -> Estimate:

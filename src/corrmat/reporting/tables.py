@@ -122,7 +122,7 @@ def markdown_summary(records: Sequence[Record]) -> str:
         "experiment", "data", "correct matches, %", "rotation error, mean, deg",
         "rotation error, median, deg", "the paper's rotation error, deg", "minutes",
     ]  # fmt: skip
-    lines = [markdown_row(heads), "|" + "---|" * len(heads)]
+    lines = markdown_head(heads)
     for identity, group in itertools.groupby(records, key=lambda record: record.id):
         same = list(group)
         for record in same:
@@ -156,6 +156,11 @@ def markdown_tables(records: Sequence[Record]) -> str:
         parts.append(f"### {record.id}, {record.title}: {record.scale}, {record.data}\n")
         parts += [markdown_row(heads), "|" + "---|" * len(heads), *map(markdown_row, rows), ""]
     return "\n".join(parts).rstrip()
+
+
+def markdown_head(heads: Sequence[str]) -> list[str]:
+    """Build the two lines that begin a Markdown table."""
+    return [markdown_row(heads), "|" + "---|" * len(heads)]
 
 
 def markdown_row(cells: Sequence[str]) -> str:
