@@ -103,16 +103,15 @@ def test_a_plain_script_makes_the_shapes_without_a_main_guard(way, tmp_path):
     assert done.stdout.split()[-1] == "11"
 
 
-def test_assemblies_are_sound_differ_and_are_the_same_again():
-    made = [
-        shapes.make_assembly((split, index))[0] for split in ("train", "test") for index in (0, 1)
-    ]
+@pytest.mark.parametrize("make", [shapes.make_assembly, shapes.make_room])
+def test_assemblies_and_rooms_are_sound_differ_and_are_the_same_again(make):
+    made = [make((split, index))[0] for split in ("train", "test") for index in (0, 1)]
     for rows in made:
         assert rows.shape == (2048, 6)
         np.testing.assert_allclose(np.linalg.norm(rows[:, 3:], axis=1), 1, atol=1e-5)
         assert np.linalg.norm(rows[:, :3], axis=1).max() == pytest.approx(1, abs=1e-5)
     assert len({rows.tobytes() for rows in made}) == 4
-    np.testing.assert_array_equal(made[1], shapes.make_assembly(("train", 1))[0])
+    np.testing.assert_array_equal(made[1], make(("train", 1))[0])
 
 
 @pytest.mark.parametrize("small", [0, 200])

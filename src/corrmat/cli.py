@@ -89,7 +89,7 @@ def train_weights() -> None:
         from corrmat.training import recipe, runs
 
         loaded = recipe.load(options.config, options.scale, options.overrides)
-        if (loaded.scale, loaded.data) == ("laptop", "shapes+assemblies"):
+        if (loaded.scale, loaded.data) == ("laptop", "shapes+assemblies+rooms"):
             folder = options.runs / loaded.place / loaded.treatment
             results = _config_folder().parent / "results"
             ship(folder / "last.ckpt", runs.trained_facts(folder), results)

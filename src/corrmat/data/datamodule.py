@@ -28,7 +28,11 @@ from corrmat.errors import CorrmatError
 from corrmat.types import PairBatch
 
 VALIDATION_SHARE = 0.1
-GENERATED = "shapes", "assemblies"  # data sets of which there are as many shapes as one likes
+GENERATED = (
+    "shapes",
+    "assemblies",
+    "rooms",
+)  # data sets of which there are as many shapes as one likes
 _HELD_OUT_STREAM = 3  # random stream that selects the held-out training shapes
 
 
@@ -129,7 +133,7 @@ class RegistrationDataModule(L.LightningDataModule):
             takes a fraction of a millisecond; with new shapes or views, tens.
         seed: of the pairs and of the held-out shapes.
         new_shapes: train on new shapes in every epoch, of the categories of the training shapes:
-            only for "shapes" and "assemblies". No training shape of the data set is then trained
+            only for data sets of `GENERATED`. No training shape of the data set is then trained
             on, whatever the seed; those held out are the ones of seed 0.
         pair_settings: fields of `PairSettings`, e.g. num_points=512, keep=0.7.
 

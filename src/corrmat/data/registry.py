@@ -14,6 +14,7 @@ Loader = Callable[[str, int | None, Path | None], CloudSet]
 DATASETS: dict[str, Loader] = {
     "shapes": dataset.load,
     "assemblies": dataset.load_assemblies,
+    "rooms": dataset.load_rooms,
     "modelnet40": modelnet40.load,
     "folder": folder.load,
 }

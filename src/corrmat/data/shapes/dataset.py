@@ -1,6 +1,6 @@
-"""The embedded data sets: CAD-like shapes of forty families, and random assemblies of solids.
+"""The embedded data sets: CAD-like shapes of forty families, random assemblies, parts of rooms.
 
-Both are made on first use and cached. Shape i of a split is a pure function of (split, i).
+All are made on first use and cached. Shape i of a split is a pure function of (split, i).
 Families take turns, so that the first n shapes are a balanced data set of their own.
 """
 
@@ -14,17 +14,19 @@ from corrmat.data.build import build_shards
 from corrmat.data.clouds import CloudSet, cache_folder, open_shards
 from corrmat.data.shapes import families
 from corrmat.data.shapes.assemblies import assembly
+from corrmat.data.shapes.rooms import part_of_room
 from corrmat.data.shapes.solids import merged
 from corrmat.errors import CorrmatError
 
 VERSION = 1  # raise it when a shape changes; the digests of test pairs in the recipes tell
 SIZE = {"train": 4000, "test": 800}
 ASSEMBLIES = {"train": 8000, "test": 200}
+ROOMS = {"train": 2000, "test": 200}
 POINTS = 2048
 NAMES = tuple(families.FAMILIES)
-ASSEMBLY = "assembly"  # the one category of assemblies
+ASSEMBLY, ROOM = "assembly", "room"  # the one category of assemblies, and of rooms
 SMALL = 200  # up to this many shapes are made on the spot instead of building the cache
-_ASSEMBLY_SEED = 1  # families have none
+_SEEDS = {ASSEMBLY: 1, ROOM: 2}  # families have none
 
 MakeShape = Callable[[tuple[str, int]], tuple[np.ndarray, int]]
 """(split, index) -> (2048, 6) float32 points and unit face normals, and the label."""
@@ -49,6 +51,11 @@ def load(split: str, count: int | None = None, root: Path | None = None) -> Clou
 def load_assemblies(split: str, count: int | None = None, root: Path | None = None) -> CloudSet:
     """Load random assemblies; see `load`. Making them takes two minutes on two cores."""
     return _load("assemblies", split, count, ASSEMBLIES[split], (ASSEMBLY,), make_assembly)
+
+
+def load_rooms(split: str, count: int | None = None, root: Path | None = None) -> CloudSet:
+    """Load parts of furnished rooms; see `load`. Making them takes two minutes on two cores."""
+    return _load("rooms", split, count, ROOMS[split], (ROOM,), make_room)
 
 
 def _load(
@@ -90,25 +97,38 @@ def make_shape(task: tuple[str, int]) -> tuple[np.ndarray, int]:
 
 def make_assembly(task: tuple[str, int]) -> tuple[np.ndarray, int]:
     """Make one random assembly."""
+    return _make_only(ASSEMBLY, task)
+
+
+def make_room(task: tuple[str, int]) -> tuple[np.ndarray, int]:
+    """Make one part of a room."""
+    return _make_only(ROOM, task)
+
+
+def _make_only(category: str, task: tuple[str, int]) -> tuple[np.ndarray, int]:
+    """Make one shape of a data set of a single category."""
     split, index = task
-    key = np.array([_ASSEMBLY_SEED << 32 | tuple(SIZE).index(split), index], np.uint64)
-    return sample_shape(ASSEMBLY, np.random.Generator(np.random.Philox(key=key))), 0
+    key = np.array([_SEEDS[category] << 32 | tuple(SIZE).index(split), index], np.uint64)
+    return sample_shape(category, np.random.Generator(np.random.Philox(key=key))), 0
 
 
 def sample_shape(name: str, rng: np.random.Generator) -> np.ndarray:
     """Make a shape of random parts and sample it.
 
     Args:
-        name: of a family, or "assembly".
+        name: of a family, "assembly" or "room".
         rng: of the shape and its points.
 
     Returns:
         (2048, 6) float32: points and unit face normals. The points are uniform on the surface,
         centred at their mean, scaled into the unit sphere.
     """
-    make = assembly if name == ASSEMBLY else families.FAMILIES[name]
-    mesh = merged(make(rng))
-    points, faces = trimesh.sample.sample_surface(mesh, POINTS, seed=rng)[:2]
+    if name == ROOM:
+        points, normals = part_of_room(rng, POINTS)
+    else:
+        mesh = merged(assembly(rng) if name == ASSEMBLY else families.FAMILIES[name](rng))
+        points, faces = trimesh.sample.sample_surface(mesh, POINTS, seed=rng)[:2]
+        normals = mesh.face_normals[faces]
     points = points - points.mean(0)
     points = points / np.linalg.norm(points, axis=1).max()
-    return np.hstack([points, mesh.face_normals[faces]]).astype(np.float32)
+    return np.hstack([points, normals]).astype(np.float32)
