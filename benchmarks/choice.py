@@ -1,25 +1,27 @@
-"""How much coherence and support should count when `corrmat register` chooses a candidate.
+"""What `corrmat register` chooses a candidate by, and what limits its choice.
 
-    python benchmarks/choice.py        minutes
+    python benchmarks/choice.py        half an hour of one core
 
-Candidates are compared by agreement + a * coherence + b * support (`registration/register.py`).
-This tries weights on pairs of training shapes that were held out of the training of the network,
-and writes results/register/choice.json: the recall at 5 degrees and by ADD-S for each (a, b).
-Two more rows say what limits it: the best candidate of every pair, which no choice can exceed; and
-the choice where the true transform, after ICP, joins the candidates. The last rows compare how the
-chosen one, and the truth, are refined.
+A candidate's score is agreement + a * coherence + b * surprise (`registration/register.py`). On
+pairs of training shapes that were held out of the training of the network, this fits a and b, and
+tests weights and refinements. It writes results/register/choice.json.
 
-`right_matches` is how many of the network's matches, by weight, the true transform explains, for
-several numbers of anchors that its points attend to.
+The fit is a conditional logit (McFadden, 1974): the softmax of a pair's scores is the probability
+of each candidate to be the right one. Weights are fitted on pairs of even number; recalls are of
+the others. `right_matches` is how many of the network's matches, by weight, the true transform
+explains, for several numbers of anchors that its points attend to.
 """
 
 import json
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from rich.progress import track
+from scipy.optimize import minimize
+from scipy.special import logsumexp
 
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG
 from corrmat.networks.invariant import InvariantNetwork
@@ -28,11 +30,12 @@ from corrmat.registration import benchmark
 from corrmat.registration.em_icp import em_icp
 from corrmat.registration.hypotheses import Hypotheses, NetworkHypotheses
 from corrmat.registration.register import (
-    COHERENCE_WEIGHT,
-    SUPPORT_WEIGHT,
-    choose,
-    measure_candidates,
+    FINALISTS,
+    WEIGHTS,
+    measure,
     prepare_clouds,
+    ranking,
+    refine_finalists,
     to_original_units,
 )
 from corrmat.registration.shipping import held_out_pairs
@@ -41,31 +44,38 @@ from corrmat.types import PairBatch
 from corrmat.weights import load_model
 
 PATH = Path(__file__).resolve().parents[1] / "results" / "register" / "choice.json"
-WEIGHTS = (
-    (0.0, 0.0),
-    (0.0, 0.4),
-    (1.0, 0.2),
-    (1.0, 0.4),
-    (1.5, 0.0),
-    (1.5, 0.2),
-    (1.5, 0.4),
-    (1.5, 0.6),
-    (2.0, 0.4),
-)
-IN_USE = COHERENCE_WEIGHT, SUPPORT_WEIGHT
-REFINED = "generalised ICP", "EM-ICP without matches", "EM-ICP"
-PAIRS = {"real": 400, "views": 300, "clean": 100}
+TRIED = (0.0, 0.0), (WEIGHTS[0], 0.0), (0.0, WEIGHTS[1]), WEIGHTS
+PAIRS: dict[benchmark.Protocol, int] = {"real": 400, "views": 300, "clean": 100}
 ANCHORS = 64, 128, 256, 1024
 _SEED = 5  # of pairs that nothing else uses
+_SHRINKAGE = 1e-3  # of the fitted weights, for pairs that any weights get right
 
 
 class PairTables(NamedTuple):
     """What the candidates of a pair are worth; the last of them is the true transform."""
 
-    candidates: np.ndarray  # (T + 1, 5) agreement, coherence, support, degrees and ADD-S
-    refined: np.ndarray  # (3, 2) degrees and ADD-S of the chosen one, refined as in `REFINED`
-    refined_truth: np.ndarray  # (3, 2) the same of the true transform
+    measures: np.ndarray  # (2, T + 1, 3) agreement, coherence, surprise: after GICP, after EM-ICP
+    errors: np.ndarray  # (2, T + 1, 2) degrees and ADD-S, the same
+    truth_without_matches: np.ndarray  # (2,) of the truth after EM-ICP without matches
     right_matches: list[float]  # share of the matches, by weight, for each of `ANCHORS`
+
+    @property
+    def is_right(self) -> np.ndarray:
+        """Whether each candidate (T,) becomes right by EM-ICP."""
+        degrees, adds = self.errors[1, :-1].T
+        return (degrees < RECALL_DEG) | (adds < ADDS_THRESHOLD)
+
+    def choose(self, weights: tuple[float, float], finalists: int, truth: bool = False) -> int:
+        """Choose among all that EM-ICP refines of the best candidates before it.
+
+        Args:
+            weights: of coherence and surprise.
+            finalists: how many EM-ICP refines.
+            truth: whether the true transform is a candidate.
+        """
+        before, after = self.measures if truth else self.measures[:, :-1]
+        best = ranking(before, weights)[:finalists]
+        return int(best[ranking(after[best], weights)[0]])
 
 
 def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> PairTables:
@@ -75,23 +85,19 @@ def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> Pair
     hypotheses = generate(*subsamples, 0)
     rotation, translation = pairs.rotation[index].double().numpy(), pairs.translation[index].numpy()
     truth = rigid.to_homogeneous(rotation, scale * (rotation @ x.centre + translation - y.centre))
-    hypotheses = hypotheses._replace(transforms=np.stack([*hypotheses.transforms, truth]))
-    transforms, measures = measure_candidates(hypotheses, subsamples, scorer)
-    chosen = transforms[choose(measures[:-1], IN_USE)]
+    start = [*hypotheses.transforms, truth]
+    gicp = np.stack([scorer.refine(transform) for transform in start])
+    em = refine_finalists(np.stack([*gicp[:-1], truth]), hypotheses, subsamples)
+    refined = [gicp, em]
 
-    def errors_of(transforms: Sequence[np.ndarray]) -> np.ndarray:
+    def errors_of(transforms: np.ndarray) -> np.ndarray:
         in_units = [to_original_units(t, scale, x.centre, y.centre) for t in transforms]
         return np.array([benchmark.errors(pairs, index, t) for t in in_units])
 
-    def refined(transform: np.ndarray) -> list[np.ndarray]:
-        priors = None, hypotheses.prob
-        em = [em_icp(transform, *subsamples, prior) for prior in priors]
-        return [scorer.refine(transform), *em]
-
     return PairTables(
-        np.hstack([measures, errors_of(list(transforms))]),
-        errors_of(refined(chosen)),
-        errors_of(refined(truth)),
+        np.stack([measure(each, hypotheses, subsamples, scorer) for each in refined]),
+        np.stack([errors_of(each) for each in refined]),
+        errors_of(em_icp(truth, *subsamples, None)[None])[0],
         [matches_of(generate, count, subsamples).support(truth, *subsamples) for count in ANCHORS],
     )
 
@@ -109,13 +115,45 @@ def matches_of(
         network.test_anchors = usual
 
 
-def recalls(tables: Sequence[np.ndarray], weights: tuple[float, float] | None) -> dict[str, float]:
-    """Compute the recall of choosing by weights; of the best candidate of each pair if None."""
-    chosen = []
+def fit(tables: Sequence[PairTables]) -> dict[str, float]:
+    """Fit the weights of agreement and surprise, beside coherence's 1, to right candidates."""
+    mixed = [table for table in tables if 0 < table.is_right.sum() < len(table.is_right)]
+
+    def loss(weights: np.ndarray) -> float:
+        total = 0.0
+        for table in mixed:
+            scores = table.measures[1, :-1] @ weights
+            total += logsumexp(scores) - logsumexp(scores[table.is_right])
+        return total / len(mixed) + _SHRINKAGE * float(weights @ weights)
+
+    agreement, coherence, surprise = minimize(loss, np.array([10.0, 10.0, -1.0])).x
+    fitted = {"agreement": agreement / coherence, "surprise": surprise / coherence}
+    return {name: round(float(weight), 4) for name, weight in fitted.items()}
+
+
+def recalls(tables: Sequence[PairTables]) -> dict[str, dict[str, float]]:
+    """Compute the recalls of weights and refinements."""
+    rows: dict[str, list[np.ndarray]] = {}
     for table in tables:
-        best = slice(None) if weights is None else [choose(table[:, :3], weights)]
-        chosen.append(table[best, 3:].min(0))
-    return shares(chosen)
+
+        def add(name: str, errors: np.ndarray) -> None:
+            rows.setdefault(name, []).append(errors)
+
+        gicp, em = table.errors
+        count = len(em)
+        for weights in TRIED:
+            add(f"{weights[0]}, {weights[1]}", em[table.choose(weights, 1)])
+        for finalists in (2, FINALISTS, 2 * FINALISTS):
+            name = f"in use, {finalists} candidates refined by EM-ICP before the choice"
+            add(name, em[table.choose(WEIGHTS, finalists)])
+        add("best candidate", em[:-1].min(0))
+        with_truth = table.choose(WEIGHTS, FINALISTS, truth=True)
+        add("in use, the truth among the candidates", em[with_truth])
+        add("in use, generalised ICP alone", gicp[:-1][ranking(table.measures[0, :-1], WEIGHTS)[0]])
+        add("the truth, after generalised ICP", gicp[count - 1])
+        add("the truth, after EM-ICP without matches", table.truth_without_matches)
+        add("the truth, after EM-ICP", em[count - 1])
+    return {name: shares(errors) for name, errors in rows.items()}
 
 
 def shares(errors: Sequence[np.ndarray]) -> dict[str, float]:
@@ -127,36 +165,29 @@ def shares(errors: Sequence[np.ndarray]) -> dict[str, float]:
     }
 
 
-def main() -> None:
-    """Try all weights on all protocols."""
-    generate = NetworkHypotheses(load_model())
-    content: dict[str, object] = {"commit": commit(), "points": 512}
+def main(model: str = "corrmat") -> None:
+    """Measure all protocols, fit the weights, and test them."""
+    generate = NetworkHypotheses(load_model(model))
+    measured: dict[benchmark.Protocol, list[PairTables]] = {}
     for protocol, count in PAIRS.items():
         pairs = held_out_pairs(protocol, count, _SEED)
-        measured = [
+        measured[protocol] = [
             tables_of(pairs, index, generate)
             for index in track(range(len(pairs)), protocol, transient=True)
         ]
-        tables = [table.candidates for table in measured]
-        without_truth = [table[:-1] for table in tables]
-        tried = {f"{a}, {b}": recalls(without_truth, (a, b)) for a, b in WEIGHTS}
-        tried["best candidate"] = recalls(without_truth, None)
-        in_use = f"{IN_USE[0]}, {IN_USE[1]}"
-        tried[f"{in_use}, the truth among the candidates"] = recalls(tables, IN_USE)
-        for row, name in enumerate(REFINED):
-            tried[f"{in_use}, then {name}"] = shares([table.refined[row] for table in measured])
-            tried[f"the truth, after {name}"] = shares(
-                [table.refined_truth[row] for table in measured]
-            )
-        count = float(np.mean([len(table) for table in without_truth]))
-        means = np.mean([table.right_matches for table in measured], 0).round(4).tolist()
-        right = dict(zip(map(str, ANCHORS), means, strict=True))
+    fitted = fit([table for tables in measured.values() for table in tables[::2]])
+    content: dict[str, object] = {"commit": commit(), "points": 512, "fitted": fitted}
+    for protocol, tables in measured.items():
+        means = np.mean([table.right_matches for table in tables], 0).round(4).tolist()
         content[protocol] = {
-            "pairs": len(pairs), "candidates": count, "weights": tried, "right_matches": right,
-        }  # fmt: skip
-        print(protocol, json.dumps(content[protocol], indent=1), flush=True)
+            "pairs": len(tables[1::2]),
+            "candidates": float(np.mean([len(table.is_right) for table in tables])),
+            "weights": recalls(tables[1::2]),
+            "right_matches": dict(zip(map(str, ANCHORS), means, strict=True)),
+        }
+    print(json.dumps(content, indent=1))
     PATH.write_text(json.dumps(content, indent=1) + "\n")
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])

@@ -20,9 +20,11 @@ from corrmat.data.normals import estimate_normals
 from corrmat.data.scans import read_scan, write_ply
 from corrmat.data.shapes.dataset import make_shape
 from corrmat.errors import CorrmatError
+from corrmat.ops import rigid
+from corrmat.ops.correspondence import MatchabilityCorrespondence, SoftCorrespondence
 from corrmat.registration import example
 from corrmat.registration import register as registration
-from corrmat.registration.hypotheses import rough_agreement
+from corrmat.registration.hypotheses import Hypotheses, rough_agreement, unmatched_nll
 from corrmat.registration.scene import build_scene, extent
 from corrmat.registration.scoring import AlignmentScorer
 from corrmat.registration.view import registration_page
@@ -540,3 +542,33 @@ def test_points_that_are_near_on_one_side_are_coherent_and_scattered_ones_are_no
     same = AlignmentScorer(sphere, sphere).alignment(np.eye(4))
     assert same.coherence == 0  # all are near: there is nothing to explain
     assert same.agreement == pytest.approx(1, abs=1e-6)
+
+
+def test_surprise_is_the_cross_entropy_of_points_that_are_left_alone():
+    source, target = (np.zeros((4, 6)) for _ in range(2))
+    source[:, 0] = target[:, 0] = range(4)
+    nll = np.array([0.1, 0.2, 0.4, 0.8]), np.array([1.0, 2.0, 4.0, 8.0])
+    hypotheses = Hypotheses(np.eye(4)[None], np.empty((0, 2), int), np.empty(0), None, nll)
+    assert hypotheses.surprise(np.eye(4), source, target) == 0
+    shifted = rigid.to_homogeneous(np.eye(3), np.array([1.0, 0, 0]))
+    # The last source point and the first target point have none near.
+    assert hypotheses.surprise(shifted, source, target) == pytest.approx((0.8 / 4 + 1.0 / 4) / 2)
+    without = hypotheses._replace(unmatched_nll=None)
+    assert without.surprise(shifted, source, target) == 0
+
+
+def test_only_a_network_with_matchabilities_says_which_points_have_no_match(generator):
+    f_x, f_y = (torch.randn(1, n, 8, generator=generator) for n in (5, 7))
+    m_x, m_y = (torch.randn(1, n, generator=generator) for n in (5, 7))
+    matchable = MatchabilityCorrespondence(f_x, f_y, 1.0, m_x, m_y)
+    for nll, logits in zip(unmatched_nll(matchable), (m_x, m_y), strict=True):
+        torch.testing.assert_close(torch.from_numpy(nll), -(1 - logits[0].double().sigmoid()).log())
+    certain = MatchabilityCorrespondence(f_x, f_y, 1.0, m_x + 50, m_y)
+    assert (unmatched_nll(certain)[0] == 8).all()  # the network may be wrong
+    assert unmatched_nll(SoftCorrespondence(f_x, f_y)) is None
+
+
+def test_the_best_candidate_after_em_icp_is_chosen_of_those_that_were_best_before():
+    measures = np.array([[0.5, 0.1, 0.1], [0.6, 0.1, 0.5], [0.1, 0.0, 0.0], [0.5, 0.1, 0.1]])
+    assert registration.ranking(measures, (10.0, -1.0)).tolist() == [0, 3, 1, 2]
+    assert registration.ranking(measures, (0.0, 0.0)).tolist() == [1, 0, 3, 2]

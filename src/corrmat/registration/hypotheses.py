@@ -24,7 +24,9 @@ from corrmat.baselines import (
 )
 from corrmat.errors import CorrmatError
 from corrmat.ops import rigid
+from corrmat.ops.correspondence import MatchabilityCorrespondence, SoftCorrespondence
 from corrmat.ops.ransac import best_by_matches, best_distinct, fit_triples
+from corrmat.types import MATCH_DISTANCE
 
 _STRONGEST = 256  # matches that RANSAC draws from
 _INLIER_THRESHOLD = 0.15  # largest residual of a match
@@ -32,6 +34,7 @@ _BY_MATCHES, _BY_AGREEMENT = 16, 8  # hypotheses at most
 _RANKED = 500  # fits that are ranked by agreement
 _ROUGH_POINTS = 64, 256  # of source and target, to rank them by
 _ROUGH_DISTANCE = 0.3  # beyond which two points do not agree
+_MOST_SURPRISE = 8.0  # -log of a probability at most: the network may be wrong
 _SUPPORT_DISTANCE = 0.2  # residual beyond which a match does not support a transform
 _NO_MATCHES = np.empty((0, 2), np.int64), np.empty(0)
 
@@ -43,6 +46,33 @@ class Hypotheses(NamedTuple):
     matches: np.ndarray  # (K, 2) int64 rows of source and target; K may be 0
     confidence: np.ndarray  # (K,) in [0, 1]
     prob: torch.Tensor | None = None  # (N, M), probabilities of all matches
+    # (N,) and (M,): -log of the probability that a source point, or a target point, has no match.
+    unmatched_nll: tuple[np.ndarray, np.ndarray] | None = None
+
+    def surprise(self, transform: np.ndarray, source: np.ndarray, target: np.ndarray) -> float:
+        """Compute the cross-entropy of the points that a transform leaves without a match.
+
+        A wrong transform leaves points alone that the network would match. This is the part of
+        the training loss that labels such points, with the transform in the truth's place.
+
+        Args:
+            transform: (4, 4).
+            source: (N, 3 or more), rows as in `unmatched_nll`.
+            target: (M, 3 or more).
+
+        Returns:
+            Mean over the points of each cloud, matched ones counting zero, and over the clouds;
+            0 for a model without matches.
+        """
+        if self.unmatched_nll is None:
+            return 0.0
+        moved = source[:, :3] @ transform[:3, :3].T + transform[:3, 3]
+        clouds = (moved, target[:, :3]), (target[:, :3], moved)
+        means = []
+        for (points, other), nll in zip(clouds, self.unmatched_nll, strict=True):
+            distance, _ = KDTree(other).query(points, distance_upper_bound=MATCH_DISTANCE)
+            means.append(float(np.where(np.isinf(distance), nll, 0).mean()))
+        return sum(means) / 2
 
     def support(self, transform: np.ndarray, source: np.ndarray, target: np.ndarray) -> float:
         """Compute the share of the matches, by weight, that support a transform; 1 without any.
@@ -90,9 +120,10 @@ class NetworkHypotheses:
     def __call__(self, source: np.ndarray, target: np.ndarray, seed: int) -> Hypotheses:
         """Generate hypotheses for source (N, 6) and target (M, 6)."""
         x, y = (torch.from_numpy(np.asarray(c, np.float32)).unsqueeze(0) for c in (source, target))
-        own_transform, prob = self._predict(x, y)
-        if prob is None:
+        own_transform, correspondence = self._predict(x, y)
+        if correspondence is None:
             return Hypotheses(own_transform, *_NO_MATCHES)
+        prob = correspondence.prob()[0, :, : y.shape[1]].cpu()
         # The strongest entries that are the maximum of their row or of their column.
         is_max = (prob == prob.amax(0)) | (prob == prob.amax(1, keepdim=True))
         weight, place = (prob * is_max).flatten().topk(min(_STRONGEST, prob.numel()))
@@ -108,9 +139,12 @@ class NetworkHypotheses:
         ranked = [rigid.to_homogeneous(*fit) for fit in (by_matches, by_agreement)]
         transforms = np.concatenate([*ranked, own_transform])
         matches = torch.stack([i, j], 1).numpy()
-        return Hypotheses(transforms, matches, weight.double().numpy(), prob)
+        confidence = weight.double().numpy()
+        return Hypotheses(transforms, matches, confidence, prob, unmatched_nll(correspondence))
 
-    def _predict(self, x: torch.Tensor, y: torch.Tensor) -> tuple[np.ndarray, torch.Tensor | None]:
+    def _predict(
+        self, x: torch.Tensor, y: torch.Tensor
+    ) -> tuple[np.ndarray, SoftCorrespondence | None]:
         """Run the network, wherever it lies, and leave it in the mode that it was in.
 
         Args:
@@ -118,7 +152,7 @@ class NetworkHypotheses:
             y: (1, M, 6).
 
         Returns:
-            Its own transform (1, 4, 4), and the probabilities of matches (N, M); None without any.
+            Its own transform (1, 4, 4), and the correspondence matrix; None without any.
         """
         least = int(getattr(self.network, "min_points", 3))
         if min(x.shape[1], y.shape[1]) < least:
@@ -134,9 +168,22 @@ class NetworkHypotheses:
         transform = rigid.to_homogeneous(prediction.rotation.cpu(), prediction.translation.cpu())
         if not np.isfinite(transform).all():
             raise CorrmatError("the network's transform is not finite: has its training diverged?")
-        if prediction.correspondence is None:
-            return transform, None
-        return transform, prediction.correspondence.prob()[0, :, : y.shape[1]].cpu()
+        return transform, prediction.correspondence
+
+
+def unmatched_nll(c: SoftCorrespondence) -> tuple[np.ndarray, np.ndarray] | None:
+    """Compute -log P(no match) of source points (N,) and target points (M,).
+
+    Returns None for a matrix that has no such class for both.
+    """
+    if not isinstance(c, MatchabilityCorrespondence):
+        return None
+
+    def of_rows(c: MatchabilityCorrespondence) -> np.ndarray:
+        none = torch.full_like(c.feature_source[..., 0], c.num_target, dtype=torch.int64)
+        return c.nll(none)[0].clamp(max=_MOST_SURPRISE).double().cpu().numpy()
+
+    return of_rows(c), of_rows(c.transposed())
 
 
 def rough_agreement(

@@ -28,8 +28,11 @@ Refine = Literal["icp", "none"]
 MODEL_POINTS = 1024  # points of either cloud for the model
 SELECTION_POINTS = 2048  # to select among its hypotheses
 FULL_POINTS = 20_000  # to refine the selected one
-# A candidate scores agreement + these times coherence and support; see benchmarks/choice.py.
-COHERENCE_WEIGHT, SUPPORT_WEIGHT = 1.5, 0.4
+# A candidate scores agreement + these times coherence and surprise; see benchmarks/choice.py.
+WEIGHTS = 10.0, -1.0
+WITHOUT_SURPRISE = 1.5, 0.0  # for a model that does not say which points have no match
+FINALISTS = 2  # best candidates, which EM-ICP refines before one is chosen
+FINAL_POINTS = 400  # of either cloud, for that refinement
 MEDIAN = 0.6  # median distance from the centroid after scaling: a radius of about one
 NORMAL_TOLERANCE = 0.01  # by which the length of a given normal may differ from one
 FAR = 30.0  # median distances from the middle: a point beyond is a stray one and left out
@@ -107,8 +110,16 @@ def register(
     start = time.perf_counter()
     (x, y), scale, subsamples, scorer = prepare_clouds(source, target, seed)
     hypotheses = generate(*subsamples, seed)
-    transforms, measures = measure_candidates(hypotheses, subsamples, scorer, refine)
-    transform = transforms[choose(measures)]
+    candidates = hypotheses.transforms
+    if refine == "icp":
+        candidates = np.stack([scorer.refine(transform) for transform in candidates])
+    weights = WITHOUT_SURPRISE if hypotheses.unmatched_nll is None else WEIGHTS
+    order = ranking(measure(candidates, hypotheses, subsamples, scorer), weights)
+    transform = candidates[order[0]]
+    if refine == "icp":
+        finalists = refine_finalists(candidates[order[:FINALISTS]], hypotheses, subsamples)
+        best = ranking(measure(finalists, hypotheses, subsamples, scorer), weights)[0]
+        transform = finalists[best]
     full = scorer
     if max(len(x.rows), len(y.rows)) > SELECTION_POINTS:
         full = AlignmentScorer(x.points(scale, FULL_POINTS), y.points(scale, FULL_POINTS))
@@ -157,40 +168,46 @@ def prepare_clouds(source: np.ndarray, target: np.ndarray, seed: int) -> Prepare
     return PreparedClouds((x, y), scale, subsamples, scorer)
 
 
-def measure_candidates(
+def measure(
+    transforms: np.ndarray,
     hypotheses: Hypotheses,
     subsamples: tuple[np.ndarray, np.ndarray],
     scorer: AlignmentScorer,
-    refine: Refine = "icp",
-) -> tuple[np.ndarray, np.ndarray]:
-    """Refine the hypotheses, and measure what the choice among them weighs.
+) -> np.ndarray:
+    """Measure what the choice among transforms weighs.
 
     Args:
-        hypotheses: of the transform.
+        transforms: (T, 4, 4).
+        hypotheses: of the model.
         subsamples: the clouds that they were made from.
-        scorer: of the clouds to refine and measure them on.
-        refine: as for `register`.
+        scorer: of the clouds to measure the transforms on.
 
     Returns:
-        Transforms (T, 4, 4); and (T, 3): agreement, coherence, support.
+        (T, 3): agreement, coherence, surprise.
     """
-    transforms = hypotheses.transforms
-    if refine == "icp":
-        transforms = np.stack([scorer.refine(transform) for transform in transforms])
-    measures = [(*scorer.alignment(t), hypotheses.support(t, *subsamples)) for t in transforms]
-    return transforms, np.array(measures)
+    rows = [(*scorer.alignment(t), hypotheses.surprise(t, *subsamples)) for t in transforms]
+    return np.array(rows)
 
 
-def choose(
-    measures: np.ndarray, weights: tuple[float, float] = (COHERENCE_WEIGHT, SUPPORT_WEIGHT)
-) -> int:
-    """Return the candidate of the highest score.
+def ranking(measures: np.ndarray, weights: tuple[float, float]) -> np.ndarray:
+    """Rank candidates by their score: (T,) indices, best first.
 
     Args:
-        measures: (T, 3) of `measure_candidates`.
-        weights: of coherence and support, beside agreement's 1.
+        measures: (T, 3) of `measure`.
+        weights: of coherence and surprise, beside agreement's 1.
     """
-    return int(np.argmax(measures @ [1.0, *weights]))
+    return np.argsort(-(measures @ [1.0, *weights]), kind="stable")
+
+
+def refine_finalists(
+    transforms: np.ndarray, hypotheses: Hypotheses, subsamples: tuple[np.ndarray, np.ndarray]
+) -> np.ndarray:
+    """Refine transforms (T, 4, 4) by EM-ICP on few points: (T, 4, 4)."""
+    source, target = (cloud[:FINAL_POINTS] for cloud in subsamples)
+    prob = hypotheses.prob
+    if prob is not None:
+        prob = prob[: len(source), : len(target)]
+    return np.stack([em_icp(transform, source, target, prob) for transform in transforms])
 
 
 def refine_chosen(
@@ -199,7 +216,7 @@ def refine_chosen(
     subsamples: tuple[np.ndarray, np.ndarray],
     full: AlignmentScorer,
 ) -> np.ndarray:
-    """Refine the chosen transform (4, 4): by EM-ICP, with the model's matches where it has any.
+    """Refine the chosen transform (4, 4) on all points, with the model's matches where it has any.
 
     Generalised ICP follows where it is more exact: on points that the model has not seen, and on
     points that both clouds share.
@@ -210,7 +227,8 @@ def refine_chosen(
         subsamples: the clouds that they were made from.
         full: scorer of the clouds, with all their points.
     """
-    transform = em_icp(transform, *subsamples, hypotheses.prob)
+    if max(map(len, subsamples)) > FINAL_POINTS:
+        transform = em_icp(transform, *subsamples, hypotheses.prob)
     more = max(len(full.source), len(full.target)) > MODEL_POINTS
     return full.refine(transform) if more or full.shares_points(transform) else transform
 
