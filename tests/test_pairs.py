@@ -417,3 +417,8 @@ def test_part_of_the_pairs_are_views(clouds):
 def test_views_need_two_scans(wrong):
     with pytest.raises(CorrmatError, match="out of range"):
         PairSettings(**wrong)
+
+
+def test_a_crop_that_leaves_two_points_is_refused():
+    with pytest.raises(CorrmatError, match="num_points = 3, of which keep = 0.7 leaves 2"):
+        PairSettings(num_points=3, keep=0.7)

@@ -155,6 +155,8 @@ def export_model(model: str | Path, folder: str | Path) -> None:
     if model == "corrmat" or model in shipped_models():
         about, content = shipped_metadata(model), _shipped_file(model).read_bytes()
         card = _model_card(model, about)
+    elif _safetensors_file(model):
+        raise CorrmatError(f"{model} is exported already: copy its folder")
     else:
         name, hparams, network = checkpoint_network(Path(model))
         from corrmat.methods import METHODS  # imports Lightning, as `checkpoint_network` does

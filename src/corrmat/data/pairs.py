@@ -80,7 +80,7 @@ class PairSettings:
             "rotation_deg": 0 <= self.rotation_deg <= 180,
             "min_rotation_deg": 0 <= self.min_rotation_deg <= self.rotation_deg,
             "translation": self.translation >= 0,
-            "keep": 0 < self.keep <= 1 and round(self.keep * self.num_points) >= 3,
+            "keep": 0 < self.keep <= 1,
             "jitter": self.jitter >= 0,
             "outliers": 0 <= self.outliers < 1,
             "outlier_distance": self.outlier_distance is None or self.outlier_distance > 0,
@@ -92,6 +92,11 @@ class PairSettings:
         for name, valid in checks.items():
             if not valid:
                 raise CorrmatError(f"{name} = {getattr(self, name)} is out of range")
+        if self.num_source < 3:
+            raise CorrmatError(
+                f"num_points = {self.num_points}, of which keep = {self.keep} leaves "
+                f"{self.num_source}: a rotation needs at least 3"
+            )
 
     @property
     def num_source(self) -> int:
