@@ -1,6 +1,6 @@
 """What `corrmat register` chooses a candidate by, and what limits its choice.
 
-    python benchmarks/choice.py        half an hour of one core
+    python benchmarks/choice.py        half an hour
 
 A candidate's score is agreement + a * coherence + b * surprise (`registration/register.py`). On
 pairs of training shapes that were held out of the training of the network, this fits a and b, and
@@ -46,7 +46,7 @@ from corrmat.weights import load_model
 PATH = Path(__file__).resolve().parents[1] / "results" / "register" / "choice.json"
 TRIED = (0.0, 0.0), (WEIGHTS[0], 0.0), (0.0, WEIGHTS[1]), WEIGHTS
 PAIRS: dict[benchmark.Protocol, int] = {"real": 400, "views": 300, "clean": 100}
-ANCHORS = 64, 128, 256, 1024
+ANCHORS = 64, 256
 _SEED = 5  # of pairs that nothing else uses
 _SHRINKAGE = 1e-3  # of the fitted weights, for pairs that any weights get right
 
