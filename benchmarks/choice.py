@@ -2,13 +2,10 @@
 
     python benchmarks/choice.py        half an hour
 
-A candidate's score is agreement + a * coherence + b * surprise (`registration/register.py`). On
-pairs of training shapes that were held out of the training of the network, this fits a and b, and
-tests weights and refinements. It writes results/register/choice.json.
-
-The fit is a conditional logit (McFadden, 1974): the softmax of a pair's scores is the probability
-of each candidate to be the right one. Weights are fitted on pairs of even number; recalls are of
-the others. `right_matches` is how many of the network's matches, by weight, the true transform
+A candidate's score is agreement + a * coherence + b * surprise (`registration/register.py`). This
+tests weights and refinements on pairs of training shapes that were held out of the training of the
+network, and writes results/register/choice.json. The weights in use were chosen on other such
+pairs. `right_matches` is how many of the network's matches, by weight, the true transform
 explains, for several numbers of anchors that its points attend to.
 """
 
@@ -20,8 +17,6 @@ from typing import NamedTuple
 
 import numpy as np
 from rich.progress import track
-from scipy.optimize import minimize
-from scipy.special import logsumexp
 
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG
 from corrmat.networks.invariant import InvariantNetwork
@@ -45,10 +40,9 @@ from corrmat.weights import load_model
 
 PATH = Path(__file__).resolve().parents[1] / "results" / "register" / "choice.json"
 TRIED = (0.0, 0.0), (WEIGHTS[0], 0.0), (0.0, WEIGHTS[1]), WEIGHTS
-PAIRS: dict[benchmark.Protocol, int] = {"real": 400, "views": 300, "clean": 100}
+PAIRS: dict[benchmark.Protocol, int] = {"real": 200, "views": 120, "clean": 80}
 ANCHORS = 64, 256
 _SEED = 5  # of pairs that nothing else uses
-_SHRINKAGE = 1e-3  # of the fitted weights, for pairs that any weights get right
 
 
 class PairTables(NamedTuple):
@@ -58,12 +52,6 @@ class PairTables(NamedTuple):
     errors: np.ndarray  # (2, T + 1, 2) degrees and ADD-S, the same
     truth_without_matches: np.ndarray  # (2,) of the truth after EM-ICP without matches
     right_matches: list[float]  # share of the matches, by weight, for each of `ANCHORS`
-
-    @property
-    def is_right(self) -> np.ndarray:
-        """Whether each candidate (T,) becomes right by EM-ICP."""
-        degrees, adds = self.errors[1, :-1].T
-        return (degrees < RECALL_DEG) | (adds < ADDS_THRESHOLD)
 
     def choose(self, weights: tuple[float, float], finalists: int, truth: bool = False) -> int:
         """Choose among all that EM-ICP refines of the best candidates before it.
@@ -115,22 +103,6 @@ def matches_of(
         network.test_anchors = usual
 
 
-def fit(tables: Sequence[PairTables]) -> dict[str, float]:
-    """Fit the weights of agreement and surprise, beside coherence's 1, to right candidates."""
-    mixed = [table for table in tables if 0 < table.is_right.sum() < len(table.is_right)]
-
-    def loss(weights: np.ndarray) -> float:
-        total = 0.0
-        for table in mixed:
-            scores = table.measures[1, :-1] @ weights
-            total += logsumexp(scores) - logsumexp(scores[table.is_right])
-        return total / len(mixed) + _SHRINKAGE * float(weights @ weights)
-
-    agreement, coherence, surprise = minimize(loss, np.array([10.0, 10.0, -1.0])).x
-    fitted = {"agreement": agreement / coherence, "surprise": surprise / coherence}
-    return {name: round(float(weight), 4) for name, weight in fitted.items()}
-
-
 def recalls(tables: Sequence[PairTables]) -> dict[str, dict[str, float]]:
     """Compute the recalls of weights and refinements."""
     rows: dict[str, list[np.ndarray]] = {}
@@ -143,7 +115,7 @@ def recalls(tables: Sequence[PairTables]) -> dict[str, dict[str, float]]:
         count = len(em)
         for weights in TRIED:
             add(f"{weights[0]}, {weights[1]}", em[table.choose(weights, 1)])
-        for finalists in (2, FINALISTS, 2 * FINALISTS):
+        for finalists in (FINALISTS, 2 * FINALISTS):
             name = f"in use, {finalists} candidates refined by EM-ICP before the choice"
             add(name, em[table.choose(WEIGHTS, finalists)])
         add("best candidate", em[:-1].min(0))
@@ -166,23 +138,20 @@ def shares(errors: Sequence[np.ndarray]) -> dict[str, float]:
 
 
 def main(model: str = "corrmat") -> None:
-    """Measure all protocols, fit the weights, and test them."""
+    """Try all weights and refinements on all protocols."""
     generate = NetworkHypotheses(load_model(model))
-    measured: dict[benchmark.Protocol, list[PairTables]] = {}
+    content: dict[str, object] = {"commit": commit(), "points": 512}
     for protocol, count in PAIRS.items():
         pairs = held_out_pairs(protocol, count, _SEED)
-        measured[protocol] = [
+        tables = [
             tables_of(pairs, index, generate)
             for index in track(range(len(pairs)), protocol, transient=True)
         ]
-    fitted = fit([table for tables in measured.values() for table in tables[::2]])
-    content: dict[str, object] = {"commit": commit(), "points": 512, "fitted": fitted}
-    for protocol, tables in measured.items():
         means = np.mean([table.right_matches for table in tables], 0).round(4).tolist()
         content[protocol] = {
-            "pairs": len(tables[1::2]),
-            "candidates": float(np.mean([len(table.is_right) for table in tables])),
-            "weights": recalls(tables[1::2]),
+            "pairs": len(tables),
+            "candidates": float(np.mean([len(table.errors[0]) - 1 for table in tables])),
+            "weights": recalls(tables),
             "right_matches": dict(zip(map(str, ANCHORS), means, strict=True)),
         }
     print(json.dumps(content, indent=1))

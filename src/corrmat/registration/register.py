@@ -29,9 +29,9 @@ MODEL_POINTS = 1024  # points of either cloud for the model
 SELECTION_POINTS = 2048  # to select among its hypotheses
 FULL_POINTS = 20_000  # to refine the selected one
 # A candidate scores agreement + these times coherence and surprise; see benchmarks/choice.py.
-WEIGHTS = 10.0, -1.0
+WEIGHTS = 4.0, -1.0
 WITHOUT_SURPRISE = 1.5, 0.0  # for a model that does not say which points have no match
-FINALISTS = 2  # best candidates, which EM-ICP refines before one is chosen
+FINALISTS = 3  # best candidates, which EM-ICP refines before one is chosen
 FINAL_POINTS = 400  # of either cloud, for that refinement
 MEDIAN = 0.6  # median distance from the centroid after scaling: a radius of about one
 NORMAL_TOLERANCE = 0.01  # by which the length of a given normal may differ from one
