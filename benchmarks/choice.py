@@ -40,7 +40,7 @@ from corrmat.weights import load_model
 
 PATH = Path(__file__).resolve().parents[1] / "results" / "register" / "choice.json"
 TRIED = (0.0, 0.0), (WEIGHTS[0], 0.0), (0.0, WEIGHTS[1]), WEIGHTS
-PAIRS: dict[benchmark.Protocol, int] = {"real": 200, "views": 120, "clean": 80}
+PAIRS: dict[benchmark.Protocol, int] = {"real": 120, "views": 80, "clean": 60}
 ANCHORS = 64, 256
 _SEED = 5  # of pairs that nothing else uses
 
