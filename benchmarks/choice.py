@@ -2,10 +2,10 @@
 
     python benchmarks/choice.py        half an hour
 
-A candidate's score is agreement + a * coherence + b * surprise (`registration/register.py`). This
-tests weights and refinements on pairs of training shapes that were held out of the training of the
-network, and writes results/register/choice.json. The weights in use were chosen on other such
-pairs. `right_matches` is how many of the network's matches, by weight, the true transform
+A candidate's score is agreement + a * coherence + b * unmatched loss (`registration/register.py`).
+This tests weights and refinements on pairs of training shapes that were held out of the training
+of the network, and writes results/register/choice.json. The weights in use were chosen on other
+such pairs. `right_matches` is how many of the network's matches, by weight, the true transform
 explains, for several numbers of anchors that its points attend to.
 """
 
@@ -25,12 +25,12 @@ from corrmat.registration import benchmark
 from corrmat.registration.em_icp import em_icp
 from corrmat.registration.hypotheses import Hypotheses, NetworkHypotheses
 from corrmat.registration.register import (
-    FINALISTS,
-    WEIGHTS,
+    CHOICE_WEIGHTS,
+    SHORTLIST,
     measure,
     prepare_clouds,
     ranking,
-    refine_finalists,
+    refine_shortlist,
     to_original_units,
 )
 from corrmat.registration.shipping import held_out_pairs
@@ -39,7 +39,12 @@ from corrmat.types import PairBatch
 from corrmat.weights import load_model
 
 PATH = Path(__file__).resolve().parents[1] / "results" / "register" / "choice.json"
-TRIED = (0.0, 0.0), (WEIGHTS[0], 0.0), (0.0, WEIGHTS[1]), WEIGHTS
+_COHERENCE, _UNMATCHED = CHOICE_WEIGHTS
+TRIED = (
+    (0.0, 0.0), (1.5, 0.0), (_COHERENCE, 0.0), (0.0, _UNMATCHED), CHOICE_WEIGHTS,
+    (_COHERENCE / 2, _UNMATCHED), (2 * _COHERENCE, _UNMATCHED),
+    (_COHERENCE, _UNMATCHED / 2), (_COHERENCE, 2 * _UNMATCHED),
+)  # fmt: skip
 PAIRS: dict[benchmark.Protocol, int] = {"real": 120, "views": 80, "clean": 60}
 ANCHORS = 64, 256
 _SEED = 5  # of pairs that nothing else uses
@@ -48,21 +53,23 @@ _SEED = 5  # of pairs that nothing else uses
 class PairTables(NamedTuple):
     """What the candidates of a pair are worth; the last of them is the true transform."""
 
-    measures: np.ndarray  # (2, T + 1, 3) agreement, coherence, surprise: after GICP, after EM-ICP
+    measures: (
+        np.ndarray
+    )  # (2, T + 1, 3) agreement, coherence, unmatched loss: after GICP, after EM-ICP
     errors: np.ndarray  # (2, T + 1, 2) degrees and ADD-S, the same
     truth_without_matches: np.ndarray  # (2,) of the truth after EM-ICP without matches
     right_matches: list[float]  # share of the matches, by weight, for each of `ANCHORS`
 
-    def choose(self, weights: tuple[float, float], finalists: int, truth: bool = False) -> int:
+    def choose(self, weights: tuple[float, float], shortlist: int, truth: bool = False) -> int:
         """Choose among all that EM-ICP refines of the best candidates before it.
 
         Args:
-            weights: of coherence and surprise.
-            finalists: how many EM-ICP refines.
+            weights: of coherence and unmatched loss.
+            shortlist: how many EM-ICP refines.
             truth: whether the true transform is a candidate.
         """
         before, after = self.measures if truth else self.measures[:, :-1]
-        best = ranking(before, weights)[:finalists]
+        best = ranking(before, weights)[:shortlist]
         return int(best[ranking(after[best], weights)[0]])
 
 
@@ -75,7 +82,7 @@ def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> Pair
     truth = rigid.to_homogeneous(rotation, scale * (rotation @ x.centre + translation - y.centre))
     start = [*hypotheses.transforms, truth]
     gicp = np.stack([scorer.refine(transform) for transform in start])
-    em = refine_finalists(np.stack([*gicp[:-1], truth]), hypotheses, subsamples)
+    em = refine_shortlist(np.stack([*gicp[:-1], truth]), hypotheses, subsamples)
     refined = [gicp, em]
 
     def errors_of(transforms: np.ndarray) -> np.ndarray:
@@ -112,19 +119,21 @@ def recalls(tables: Sequence[PairTables]) -> dict[str, dict[str, float]]:
             rows.setdefault(name, []).append(errors)
 
         gicp, em = table.errors
-        count = len(em)
         for weights in TRIED:
             add(f"{weights[0]}, {weights[1]}", em[table.choose(weights, 1)])
-        for finalists in (FINALISTS, 2 * FINALISTS):
-            name = f"in use, {finalists} candidates refined by EM-ICP before the choice"
-            add(name, em[table.choose(WEIGHTS, finalists)])
+        for shortlist in (SHORTLIST, 2 * SHORTLIST):
+            name = f"in use, {shortlist} candidates refined by EM-ICP before the choice"
+            add(name, em[table.choose(CHOICE_WEIGHTS, shortlist)])
         add("best candidate", em[:-1].min(0))
-        with_truth = table.choose(WEIGHTS, FINALISTS, truth=True)
+        with_truth = table.choose(CHOICE_WEIGHTS, SHORTLIST, truth=True)
         add("in use, the truth among the candidates", em[with_truth])
-        add("in use, generalised ICP alone", gicp[:-1][ranking(table.measures[0, :-1], WEIGHTS)[0]])
-        add("the truth, after generalised ICP", gicp[count - 1])
+        add(
+            "in use, generalised ICP alone",
+            gicp[:-1][ranking(table.measures[0, :-1], CHOICE_WEIGHTS)[0]],
+        )
+        add("the truth, after generalised ICP", gicp[-1])
         add("the truth, after EM-ICP without matches", table.truth_without_matches)
-        add("the truth, after EM-ICP", em[count - 1])
+        add("the truth, after EM-ICP", em[-1])
     return {name: shares(errors) for name, errors in rows.items()}
 
 

@@ -22,7 +22,8 @@ GROUPS = {"first": NAMES[0::4], "second": NAMES[2::4]}
 DATA = "shapes+assemblies"  # all are tested on objects
 SETTINGS = {  # 8,000 pairs
     "start": "null", "seed": 0, "network.layers": 2, "trainer.max_steps": 1000,
-    "data.data": DATA, "data.train_shapes": "null",
+    "data.data": DATA, "data.train_shapes": "null", "data.num_points": 512, "data.keep": 0.7,
+    "optimizer.lr": 1e-3,
 }  # fmt: skip
 
 

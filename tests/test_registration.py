@@ -544,17 +544,27 @@ def test_points_that_are_near_on_one_side_are_coherent_and_scattered_ones_are_no
     assert same.agreement == pytest.approx(1, abs=1e-6)
 
 
-def test_surprise_is_the_cross_entropy_of_points_that_are_left_alone():
-    source, target = (np.zeros((4, 6)) for _ in range(2))
-    source[:, 0] = target[:, 0] = range(4)
+@pytest.mark.parametrize("shift", [0.0, 0.07])
+def test_points_that_have_one_near_cost_nothing(shift):
+    assert unmatched_loss(shift) == 0
+
+
+@pytest.mark.parametrize("shift", [0.09, 1.0])
+def test_the_unmatched_loss_is_the_cross_entropy_of_points_without_one_near(shift):
+    # Moved by one, the last source point and the first target point have none; by 0.09, all.
+    expected = 0.375 + 3.75 if shift < 1 else 0.8 / 4 + 1.0 / 4
+    assert unmatched_loss(shift) == pytest.approx(expected / 2)
+
+
+def unmatched_loss(shift):
+    """Of four points in a row, one apart, under a translation along it."""
+    row = np.zeros((4, 6))
+    row[:, 0] = range(4)
     nll = np.array([0.1, 0.2, 0.4, 0.8]), np.array([1.0, 2.0, 4.0, 8.0])
     hypotheses = Hypotheses(np.eye(4)[None], np.empty((0, 2), int), np.empty(0), None, nll)
-    assert hypotheses.surprise(np.eye(4), source, target) == 0
-    shifted = rigid.to_homogeneous(np.eye(3), np.array([1.0, 0, 0]))
-    # The last source point and the first target point have none near.
-    assert hypotheses.surprise(shifted, source, target) == pytest.approx((0.8 / 4 + 1.0 / 4) / 2)
-    without = hypotheses._replace(unmatched_nll=None)
-    assert without.surprise(shifted, source, target) == 0
+    transform = rigid.to_homogeneous(np.eye(3), np.array([shift, 0, 0]))
+    assert hypotheses._replace(unmatched_nll=None).unmatched_loss(transform, row, row) == 0
+    return hypotheses.unmatched_loss(transform, row, row)
 
 
 def test_only_a_network_with_matchabilities_says_which_points_have_no_match(generator):
@@ -566,9 +576,28 @@ def test_only_a_network_with_matchabilities_says_which_points_have_no_match(gene
     certain = MatchabilityCorrespondence(f_x, f_y, 1.0, m_x + 50, m_y)
     assert (unmatched_nll(certain)[0] == 8).all()  # the network may be wrong
     assert unmatched_nll(SoftCorrespondence(f_x, f_y)) is None
+    assert unmatched_nll(SoftCorrespondence(f_x, f_y, 1.0, m_x)) is None  # of the source alone
 
 
-def test_the_best_candidate_after_em_icp_is_chosen_of_those_that_were_best_before():
+def test_candidates_are_ranked_by_the_weighted_sum_of_their_measures():
     measures = np.array([[0.5, 0.1, 0.1], [0.6, 0.1, 0.5], [0.1, 0.0, 0.0], [0.5, 0.1, 0.1]])
     assert registration.ranking(measures, (10.0, -1.0)).tolist() == [0, 3, 1, 2]
     assert registration.ranking(measures, (0.0, 0.0)).tolist() == [1, 0, 3, 2]
+
+
+def test_em_icp_decides_between_candidates_that_generalised_icp_leaves_equal(pair, monkeypatch):
+    """The better candidate after EM-ICP wins, whatever the order before."""
+    _, source, target, truth = pair
+    refined = []
+
+    def refine(transforms, hypotheses, subsamples):
+        best = original(transforms, hypotheses, subsamples)
+        turned = best[0] @ np.diag([-1.0, -1.0, 1.0, 1.0])
+        refined.append(turned)
+        return np.stack([turned, best[0]])
+
+    original = registration.refine_shortlist
+    monkeypatch.setattr(registration, "refine_shortlist", refine)
+    found = corrmat.register(source, target).transform
+    assert len(refined) == 1
+    assert angle_deg(found, truth) < 2

@@ -7,6 +7,7 @@ import pytest
 from corrmat.data import build, clouds, registry
 from corrmat.data.shapes import dataset as shapes
 from corrmat.data.shapes.families import FAMILIES
+from corrmat.data.shapes.rooms import part_of_room
 from corrmat.errors import CorrmatError
 
 
@@ -128,3 +129,18 @@ def test_data_sets_are_joined(small, monkeypatch):
     assert len(registry.load_clouds("shapes+assemblies", "train")) == 14
     with pytest.raises(CorrmatError, match="unknown data set 'shops'"):
         registry.load_clouds("shapes+shops", "train")
+
+
+def test_parts_of_a_room_differ_in_size():
+    extents = [
+        np.ptp(part_of_room(np.random.default_rng(seed), 500)[0], axis=0)[:2].max()
+        for seed in range(6)
+    ]
+    assert max(extents) > 1.3 * min(extents)
+    assert max(extents) < 7.5  # metres: the longest room, and its walls
+
+
+def test_rooms_are_a_data_set():
+    rooms = registry.load_clouds("rooms", "test", 2)
+    assert [rooms.names[label] for label in rooms.labels] == ["room", "room"]
+    np.testing.assert_array_equal(rooms.rows[1], shapes.make_room(("test", 1))[0])

@@ -109,7 +109,7 @@ def test_what_cannot_be_exported_or_loaded_is_said(tmp_path, monkeypatch):
     with pytest.raises(CorrmatError, match="no model '1.2/DPC': neither corrmat, 1.1/"):
         weights.export_model("1.2/DPC", tmp_path)
     weights.export_model("2.1/RPMNet", tmp_path / "exported")
-    with pytest.raises(CorrmatError, match="is exported already"):
+    with pytest.raises(CorrmatError, match="is an exported model already"):
         weights.export_model(tmp_path / "exported", tmp_path / "again")
     safetensors.torch.save_file({"x": torch.zeros(1)}, tmp_path / "model.safetensors")
     with pytest.raises(CorrmatError, match="is no model of corrmat"):

@@ -89,7 +89,8 @@ def train_weights() -> None:
         from corrmat.training import recipe, runs
 
         loaded = recipe.load(options.config, options.scale, options.overrides)
-        if (loaded.scale, loaded.data) == ("laptop", "shapes+assemblies+rooms"):
+        shipped = recipe.load(options.config, "laptop")
+        if (loaded.scale, loaded.data) == (shipped.scale, shipped.data):
             folder = options.runs / loaded.place / loaded.treatment
             results = _config_folder().parent / "results"
             ship(folder / "last.ckpt", runs.trained_facts(folder), results)

@@ -277,7 +277,9 @@ def _add_compare_options(parser: ArgumentParser) -> None:
         default="real",
         help="see below",
     )
-    parser.add_argument("--data", default="shapes", help="shapes, modelnet40 or folder")
+    parser.add_argument(
+        "--data", default="shapes", help="shapes, assemblies, rooms, modelnet40 or folder"
+    )
     parser.add_argument("--root", type=Path, help="folder of the data set")
     parser.add_argument(
         "--points", type=_positive, default=512, help="points of a cloud before it is cropped"

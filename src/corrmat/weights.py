@@ -149,14 +149,14 @@ def export_model(model: str | Path, folder: str | Path) -> None:
         folder: to write into; it is made.
 
     Raises:
-        CorrmatError: there are no such weights.
+        CorrmatError: there are no such weights, or they are an exported model.
     """
     model, folder = str(model), Path(folder)
     if model == "corrmat" or model in shipped_models():
         about, content = shipped_metadata(model), _shipped_file(model).read_bytes()
         card = _model_card(model, about)
-    elif _safetensors_file(model):
-        raise CorrmatError(f"{model} is exported already: copy its folder")
+    elif model.startswith("hf:") or _safetensors_file(model):
+        raise CorrmatError(f"{model} is an exported model already")
     else:
         name, hparams, network = checkpoint_network(Path(model))
         from corrmat.methods import METHODS  # imports Lightning, as `checkpoint_network` does

@@ -28,11 +28,8 @@ from corrmat.errors import CorrmatError
 from corrmat.types import PairBatch
 
 VALIDATION_SHARE = 0.1
-GENERATED = (
-    "shapes",
-    "assemblies",
-    "rooms",
-)  # data sets of which there are as many shapes as one likes
+# Data sets of which there are as many shapes as one likes.
+GENERATED = "shapes", "assemblies", "rooms"
 _HELD_OUT_STREAM = 3  # random stream that selects the held-out training shapes
 
 
@@ -121,9 +118,10 @@ class RegistrationDataModule(L.LightningDataModule):
     """Pairs made on the fly: frozen for validation and test, new ones each epoch for training.
 
     Args:
-        data: a data set of `corrmat.data.registry`: "shapes" (embedded), "modelnet40" (official
-            HDF5 files) or "folder" (meshes or clouds of your own).
-        root: folder of the data set; not needed for "shapes".
+        data: a data set of `corrmat.data.registry`: "shapes", "assemblies" or "rooms" (embedded),
+            "modelnet40" (official HDF5 files) or "folder" (meshes or clouds of your own); or
+            several, e.g. "shapes+assemblies".
+        root: folder of "modelnet40" or "folder".
         name: what the data set is called in results/; by default `data`, or the folder's name.
         batch_size: pairs a batch.
         categories: only these; all by default.

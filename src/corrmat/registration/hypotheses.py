@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from scipy.spatial import KDTree
 from torch import nn
 
@@ -34,7 +35,7 @@ _BY_MATCHES, _BY_AGREEMENT = 16, 8  # hypotheses at most
 _RANKED = 500  # fits that are ranked by agreement
 _ROUGH_POINTS = 64, 256  # of source and target, to rank them by
 _ROUGH_DISTANCE = 0.3  # beyond which two points do not agree
-_MOST_SURPRISE = 8.0  # -log of a probability at most: the network may be wrong
+_MAX_UNMATCHED_NLL = 8.0  # of a point: the network may be wrong
 _SUPPORT_DISTANCE = 0.2  # residual beyond which a match does not support a transform
 _NO_MATCHES = np.empty((0, 2), np.int64), np.empty(0)
 
@@ -49,11 +50,13 @@ class Hypotheses(NamedTuple):
     # (N,) and (M,): -log of the probability that a source point, or a target point, has no match.
     unmatched_nll: tuple[np.ndarray, np.ndarray] | None = None
 
-    def surprise(self, transform: np.ndarray, source: np.ndarray, target: np.ndarray) -> float:
+    def unmatched_loss(
+        self, transform: np.ndarray, source: np.ndarray, target: np.ndarray
+    ) -> float:
         """Compute the cross-entropy of the points that a transform leaves without a match.
 
-        A wrong transform leaves points alone that the network would match. This is the part of
-        the training loss that labels such points, with the transform in the truth's place.
+        A wrong transform leaves points without a match that the network would match. This is the
+        part of the training loss that labels such points, with the transform in the truth's place.
 
         Args:
             transform: (4, 4).
@@ -62,7 +65,7 @@ class Hypotheses(NamedTuple):
 
         Returns:
             Mean over the points of each cloud, matched ones counting zero, and over the clouds;
-            0 for a model without matches.
+            0 without `unmatched_nll`.
         """
         if self.unmatched_nll is None:
             return 0.0
@@ -174,16 +177,16 @@ class NetworkHypotheses:
 def unmatched_nll(c: SoftCorrespondence) -> tuple[np.ndarray, np.ndarray] | None:
     """Compute -log P(no match) of source points (N,) and target points (M,).
 
-    Returns None for a matrix that has no such class for both.
+    Returns None unless the matrix has matchabilities, which say it of both clouds.
     """
     if not isinstance(c, MatchabilityCorrespondence):
         return None
-
-    def of_rows(c: MatchabilityCorrespondence) -> np.ndarray:
-        none = torch.full_like(c.feature_source[..., 0], c.num_target, dtype=torch.int64)
-        return c.nll(none)[0].clamp(max=_MOST_SURPRISE).double().cpu().numpy()
-
-    return of_rows(c), of_rows(c.transposed())
+    assert c.outlier is not None
+    source, target = (
+        -F.logsigmoid(logits[0]).clamp(min=-_MAX_UNMATCHED_NLL).double().cpu()
+        for logits in (c.outlier, -c.matchable_target)
+    )
+    return source.numpy(), target.numpy()
 
 
 def rough_agreement(

@@ -28,11 +28,11 @@ Refine = Literal["icp", "none"]
 MODEL_POINTS = 1024  # points of either cloud for the model
 SELECTION_POINTS = 2048  # to select among its hypotheses
 FULL_POINTS = 20_000  # to refine the selected one
-# A candidate scores agreement + these times coherence and surprise; see benchmarks/choice.py.
-WEIGHTS = 4.0, -1.0
-WITHOUT_SURPRISE = 1.5, 0.0  # for a model that does not say which points have no match
-FINALISTS = 3  # best candidates, which EM-ICP refines before one is chosen
-FINAL_POINTS = 400  # of either cloud, for that refinement
+# A candidate scores agreement + these times coherence and unmatched loss; benchmarks/choice.py.
+CHOICE_WEIGHTS = 4.0, -1.0
+WITHOUT_MATCHABILITIES = 1.5, 0.0  # for models that have none: no unmatched loss
+SHORTLIST = 3  # best candidates, which EM-ICP refines before one is chosen
+SHORTLIST_POINTS = 400  # of either cloud, for that refinement
 MEDIAN = 0.6  # median distance from the centroid after scaling: a radius of about one
 NORMAL_TOLERANCE = 0.01  # by which the length of a given normal may differ from one
 FAR = 30.0  # median distances from the middle: a point beyond is a stray one and left out
@@ -110,16 +110,18 @@ def register(
     start = time.perf_counter()
     (x, y), scale, subsamples, scorer = prepare_clouds(source, target, seed)
     hypotheses = generate(*subsamples, seed)
+    weights = WITHOUT_MATCHABILITIES if hypotheses.unmatched_nll is None else CHOICE_WEIGHTS
+
+    def ranked(transforms: np.ndarray) -> np.ndarray:
+        return transforms[ranking(measure(transforms, hypotheses, subsamples, scorer), weights)]
+
     candidates = hypotheses.transforms
     if refine == "icp":
         candidates = np.stack([scorer.refine(transform) for transform in candidates])
-    weights = WITHOUT_SURPRISE if hypotheses.unmatched_nll is None else WEIGHTS
-    order = ranking(measure(candidates, hypotheses, subsamples, scorer), weights)
-    transform = candidates[order[0]]
+    candidates = ranked(candidates)
     if refine == "icp":
-        finalists = refine_finalists(candidates[order[:FINALISTS]], hypotheses, subsamples)
-        best = ranking(measure(finalists, hypotheses, subsamples, scorer), weights)[0]
-        transform = finalists[best]
+        candidates = ranked(refine_shortlist(candidates[:SHORTLIST], hypotheses, subsamples))
+    transform = candidates[0]
     full = scorer
     if max(len(x.rows), len(y.rows)) > SELECTION_POINTS:
         full = AlignmentScorer(x.points(scale, FULL_POINTS), y.points(scale, FULL_POINTS))
@@ -183,9 +185,9 @@ def measure(
         scorer: of the clouds to measure the transforms on.
 
     Returns:
-        (T, 3): agreement, coherence, surprise.
+        (T, 3): agreement, coherence, unmatched loss.
     """
-    rows = [(*scorer.alignment(t), hypotheses.surprise(t, *subsamples)) for t in transforms]
+    rows = [(*scorer.alignment(t), hypotheses.unmatched_loss(t, *subsamples)) for t in transforms]
     return np.array(rows)
 
 
@@ -194,16 +196,16 @@ def ranking(measures: np.ndarray, weights: tuple[float, float]) -> np.ndarray:
 
     Args:
         measures: (T, 3) of `measure`.
-        weights: of coherence and surprise, beside agreement's 1.
+        weights: of coherence and unmatched loss, beside agreement's 1.
     """
     return np.argsort(-(measures @ [1.0, *weights]), kind="stable")
 
 
-def refine_finalists(
+def refine_shortlist(
     transforms: np.ndarray, hypotheses: Hypotheses, subsamples: tuple[np.ndarray, np.ndarray]
 ) -> np.ndarray:
     """Refine transforms (T, 4, 4) by EM-ICP on few points: (T, 4, 4)."""
-    source, target = (cloud[:FINAL_POINTS] for cloud in subsamples)
+    source, target = (cloud[:SHORTLIST_POINTS] for cloud in subsamples)
     prob = hypotheses.prob
     if prob is not None:
         prob = prob[: len(source), : len(target)]
@@ -216,10 +218,11 @@ def refine_chosen(
     subsamples: tuple[np.ndarray, np.ndarray],
     full: AlignmentScorer,
 ) -> np.ndarray:
-    """Refine the chosen transform (4, 4) on all points, with the model's matches where it has any.
+    """Refine the chosen transform (4, 4) on all of the model's points, by EM-ICP.
 
-    Generalised ICP follows where it is more exact: on points that the model has not seen, and on
-    points that both clouds share.
+    If the shortlist was refined on as many points, that has been done. Generalised ICP follows
+    where it is more exact: on points that the model has not seen, and on points that both clouds
+    share.
 
     Args:
         transform: of the source onto the target.
@@ -227,7 +230,7 @@ def refine_chosen(
         subsamples: the clouds that they were made from.
         full: scorer of the clouds, with all their points.
     """
-    if max(map(len, subsamples)) > FINAL_POINTS:
+    if max(map(len, subsamples)) > SHORTLIST_POINTS:
         transform = em_icp(transform, *subsamples, hypotheses.prob)
     more = max(len(full.source), len(full.target)) > MODEL_POINTS
     return full.refine(transform) if more or full.shares_points(transform) else transform

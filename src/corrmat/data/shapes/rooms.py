@@ -1,4 +1,4 @@
-"""Furnished rooms, in metres: what indoor scans show."""
+"""Furnished rooms, in metres. Walls and floor are solid, so their outer sides are sampled, too."""
 
 import numpy as np
 import trimesh
@@ -7,7 +7,7 @@ from corrmat.data.shapes.families import FAMILIES
 from corrmat.data.shapes.solids import box, merged
 
 _WALL_M, _HEIGHT_M = 0.1, 2.5
-_LEAST_PART = 0.4  # share of a room's surface that a part of it has at least
+_MIN_SHARE = 0.4  # least share of a room's surface that a part of it has
 # Furniture: longest side in metres.
 _SIZES = {
     "bathtub": (1.5, 1.8), "bed": (1.9, 2.2), "bench": (1.0, 1.6), "bookshelf": (1.5, 2.2),
@@ -19,26 +19,26 @@ _SIZES = {
 
 
 def part_of_room(rng: np.random.Generator, points: int) -> tuple[np.ndarray, np.ndarray]:
-    """Sample what of a random room lies near a random place: two fifths of its surface, or more.
+    """Sample the part of a random room nearest to a random place: 40 to 100 % of its surface.
 
     Args:
         rng: of the room, the place and the points.
-        points: how many.
+        points: number of points.
 
     Returns:
-        Points (P, 3) in metres and unit face normals (P, 3).
+        Points (points, 3) in metres and unit face normals (points, 3).
     """
     mesh, size = room(rng)
-    samples, faces = trimesh.sample.sample_surface(mesh, int(points / _LEAST_PART), seed=rng)[:2]
+    samples, faces = trimesh.sample.sample_surface(mesh, int(points / _MIN_SHARE), seed=rng)[:2]
     place = rng.uniform(-0.5, 0.5, 2) * size
     nearest = np.argsort(np.linalg.norm(samples[:, :2] - place, axis=1))
-    part = nearest[: int(points * rng.uniform(1, 1 / _LEAST_PART))]
+    part = nearest[: int(points * rng.uniform(1, 1 / _MIN_SHARE))]
     chosen = rng.permutation(part)[:points]
     return samples[chosen], mesh.face_normals[faces[chosen]]
 
 
 def room(rng: np.random.Generator) -> tuple[trimesh.Trimesh, np.ndarray]:
-    """Return a room's mesh, its floor centred at the origin, and the floor's size (2,)."""
+    """Return a room's mesh, its floor centred at the origin, and the floor's sides (2,)."""
     x, y = size = rng.uniform([3.5, 3.0], [7.0, 6.0])
     parts = [box((x, y, _WALL_M), (0, 0, -_WALL_M / 2))]
     walls = [box((_WALL_M, y, _HEIGHT_M), (side * x / 2, 0, _HEIGHT_M / 2)) for side in (-1, 1)] + [
