@@ -45,7 +45,7 @@ TRIED = (
     (_COHERENCE / 2, _UNMATCHED), (2 * _COHERENCE, _UNMATCHED),
     (_COHERENCE, _UNMATCHED / 2), (_COHERENCE, 2 * _UNMATCHED),
 )  # fmt: skip
-PAIRS: dict[benchmark.Protocol, int] = {"real": 120, "views": 80, "clean": 60}
+PAIRS: dict[benchmark.Protocol, int] = {"real": 100, "views": 60, "clean": 40}
 ANCHORS = 64, 256
 _SEED = 5  # of pairs that nothing else uses
 
