@@ -1,6 +1,6 @@
 """What `corrmat register` chooses a candidate by, and what limits its choice.
 
-    python benchmarks/choice.py        half an hour
+    python benchmarks/choice.py        minutes
 
 A candidate's score is agreement + a * coherence + b * unmatched loss (`registration/register.py`).
 This tests weights and refinements on pairs of training shapes that were held out of the training
@@ -10,8 +10,7 @@ explains, for several numbers of anchors that its points attend to.
 """
 
 import json
-import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -45,19 +44,18 @@ TRIED = (
     (_COHERENCE / 2, _UNMATCHED), (2 * _COHERENCE, _UNMATCHED),
     (_COHERENCE, _UNMATCHED / 2), (_COHERENCE, 2 * _UNMATCHED),
 )  # fmt: skip
-PAIRS: dict[benchmark.Protocol, int] = {"real": 100, "views": 60, "clean": 40}
+PAIRS: dict[benchmark.Protocol, int] = {"real": 200, "views": 120, "clean": 80}
 ANCHORS = 64, 256
+PRIORS = "without matches", "with matches"  # of EM-ICP
 _SEED = 5  # of pairs that nothing else uses
 
 
 class PairTables(NamedTuple):
     """What the candidates of a pair are worth; the last of them is the true transform."""
 
-    measures: (
-        np.ndarray
-    )  # (2, T + 1, 3) agreement, coherence, unmatched loss: after GICP, after EM-ICP
-    errors: np.ndarray  # (2, T + 1, 2) degrees and ADD-S, the same
-    truth_without_matches: np.ndarray  # (2,) of the truth after EM-ICP without matches
+    measures: np.ndarray  # (2, T + 1, 3) agreement, coherence, unmatched loss; see `errors`
+    errors: np.ndarray  # (2, T + 1, 2) degrees and ADD-S, after generalised ICP, then EM-ICP
+    refined_truth: np.ndarray  # (2, 2) the same of the truth after EM-ICP alone, as `PRIORS`
     right_matches: list[float]  # share of the matches, by weight, for each of `ANCHORS`
 
     def choose(self, weights: tuple[float, float], shortlist: int, truth: bool = False) -> int:
@@ -82,17 +80,17 @@ def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> Pair
     truth = rigid.to_homogeneous(rotation, scale * (rotation @ x.centre + translation - y.centre))
     start = [*hypotheses.transforms, truth]
     gicp = np.stack([scorer.refine(transform) for transform in start])
-    em = refine_shortlist(np.stack([*gicp[:-1], truth]), hypotheses, subsamples)
-    refined = [gicp, em]
+    refined = gicp, refine_shortlist(gicp, hypotheses, subsamples)
+    truths = [em_icp(truth, *subsamples, prior) for prior in (None, hypotheses.prob)]
 
-    def errors_of(transforms: np.ndarray) -> np.ndarray:
+    def errors_of(transforms: Iterable[np.ndarray]) -> np.ndarray:
         in_units = [to_original_units(t, scale, x.centre, y.centre) for t in transforms]
         return np.array([benchmark.errors(pairs, index, t) for t in in_units])
 
     return PairTables(
         np.stack([measure(each, hypotheses, subsamples, scorer) for each in refined]),
         np.stack([errors_of(each) for each in refined]),
-        errors_of(em_icp(truth, *subsamples, None)[None])[0],
+        errors_of(truths),
         [matches_of(generate, count, subsamples).support(truth, *subsamples) for count in ANCHORS],
     )
 
@@ -110,31 +108,21 @@ def matches_of(
         network.test_anchors = usual
 
 
-def recalls(tables: Sequence[PairTables]) -> dict[str, dict[str, float]]:
-    """Compute the recalls of weights and refinements."""
-    rows: dict[str, list[np.ndarray]] = {}
-    for table in tables:
-
-        def add(name: str, errors: np.ndarray) -> None:
-            rows.setdefault(name, []).append(errors)
-
-        gicp, em = table.errors
-        for weights in TRIED:
-            add(f"{weights[0]}, {weights[1]}", em[table.choose(weights, 1)])
-        for shortlist in (SHORTLIST, 2 * SHORTLIST):
-            name = f"in use, {shortlist} candidates refined by EM-ICP before the choice"
-            add(name, em[table.choose(CHOICE_WEIGHTS, shortlist)])
-        add("best candidate", em[:-1].min(0))
-        with_truth = table.choose(CHOICE_WEIGHTS, SHORTLIST, truth=True)
-        add("in use, the truth among the candidates", em[with_truth])
-        add(
-            "in use, generalised ICP alone",
-            gicp[:-1][ranking(table.measures[0, :-1], CHOICE_WEIGHTS)[0]],
-        )
-        add("the truth, after generalised ICP", gicp[-1])
-        add("the truth, after EM-ICP without matches", table.truth_without_matches)
-        add("the truth, after EM-ICP", em[-1])
-    return {name: shares(errors) for name, errors in rows.items()}
+def outcomes(table: PairTables) -> dict[str, np.ndarray]:
+    """Return the errors (2,) of one pair for all weights and refinements."""
+    gicp, em = table.errors
+    rows = {f"{a}, {b}": em[table.choose((a, b), 1)] for a, b in TRIED}
+    for shortlist in (SHORTLIST, 2 * SHORTLIST):
+        name = f"in use, {shortlist} candidates refined by EM-ICP before the choice"
+        rows[name] = em[table.choose(CHOICE_WEIGHTS, shortlist)]
+    rows["best candidate"] = em[:-1].min(0)
+    with_truth = table.choose(CHOICE_WEIGHTS, SHORTLIST, truth=True)
+    rows["in use, the truth among the candidates"] = em[with_truth]
+    rows["in use, generalised ICP alone"] = gicp[table.choose(CHOICE_WEIGHTS, 1)]
+    rows["the truth, after generalised ICP"] = gicp[-1]
+    for prior, errors in zip(PRIORS, table.refined_truth, strict=True):
+        rows[f"the truth, after EM-ICP {prior}"] = errors
+    return rows
 
 
 def shares(errors: Sequence[np.ndarray]) -> dict[str, float]:
@@ -146,9 +134,9 @@ def shares(errors: Sequence[np.ndarray]) -> dict[str, float]:
     }
 
 
-def main(model: str = "corrmat") -> None:
+def main() -> None:
     """Try all weights and refinements on all protocols."""
-    generate = NetworkHypotheses(load_model(model))
+    generate = NetworkHypotheses(load_model())
     content: dict[str, object] = {"commit": commit(), "points": 512}
     for protocol, count in PAIRS.items():
         pairs = held_out_pairs(protocol, count, _SEED)
@@ -156,11 +144,12 @@ def main(model: str = "corrmat") -> None:
             tables_of(pairs, index, generate)
             for index in track(range(len(pairs)), protocol, transient=True)
         ]
+        rows = [outcomes(table) for table in tables]
         means = np.mean([table.right_matches for table in tables], 0).round(4).tolist()
         content[protocol] = {
             "pairs": len(tables),
             "candidates": float(np.mean([len(table.errors[0]) - 1 for table in tables])),
-            "weights": recalls(tables),
+            "weights": {name: shares([row[name] for row in rows]) for name in rows[0]},
             "right_matches": dict(zip(map(str, ANCHORS), means, strict=True)),
         }
     print(json.dumps(content, indent=1))
@@ -168,4 +157,4 @@ def main(model: str = "corrmat") -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main()

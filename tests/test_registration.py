@@ -12,6 +12,7 @@ import pytest
 import torch
 from conftest import random_rotation, shared
 from PIL import Image
+from scipy.spatial import KDTree
 
 import corrmat
 from corrmat.calibration import verdict
@@ -558,8 +559,9 @@ def test_the_unmatched_loss_is_the_cross_entropy_of_points_without_one_near(shif
 
 def unmatched_loss(shift):
     """Of four points in a row, one apart, under a translation along it."""
-    row = np.zeros((4, 6))
-    row[:, 0] = range(4)
+    points = np.zeros((4, 3))
+    points[:, 0] = range(4)
+    row = KDTree(points)
     nll = np.array([0.1, 0.2, 0.4, 0.8]), np.array([1.0, 2.0, 4.0, 8.0])
     hypotheses = Hypotheses(np.eye(4)[None], np.empty((0, 2), int), np.empty(0), None, nll)
     transform = rigid.to_homogeneous(np.eye(3), np.array([shift, 0, 0]))
@@ -585,7 +587,7 @@ def test_candidates_are_ranked_by_the_weighted_sum_of_their_measures():
     assert registration.ranking(measures, (0.0, 0.0)).tolist() == [1, 0, 3, 2]
 
 
-def test_em_icp_decides_between_candidates_that_generalised_icp_leaves_equal(pair, monkeypatch):
+def test_the_best_of_the_refined_shortlist_is_chosen(pair, monkeypatch):
     """The better candidate after EM-ICP wins, whatever the order before."""
     _, source, target, truth = pair
     refined = []

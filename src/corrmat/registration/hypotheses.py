@@ -27,6 +27,7 @@ from corrmat.errors import CorrmatError
 from corrmat.ops import rigid
 from corrmat.ops.correspondence import MatchabilityCorrespondence, SoftCorrespondence
 from corrmat.ops.ransac import best_by_matches, best_distinct, fit_triples
+from corrmat.registration.scoring import nearest_both_ways
 from corrmat.types import MATCH_DISTANCE
 
 _STRONGEST = 256  # matches that RANSAC draws from
@@ -50,9 +51,7 @@ class Hypotheses(NamedTuple):
     # (N,) and (M,): -log of the probability that a source point, or a target point, has no match.
     unmatched_nll: tuple[np.ndarray, np.ndarray] | None = None
 
-    def unmatched_loss(
-        self, transform: np.ndarray, source: np.ndarray, target: np.ndarray
-    ) -> float:
+    def unmatched_loss(self, transform: np.ndarray, source: KDTree, target: KDTree) -> float:
         """Compute the cross-entropy of the points that a transform leaves without a match.
 
         A wrong transform leaves points without a match that the network would match. This is the
@@ -60,8 +59,8 @@ class Hypotheses(NamedTuple):
 
         Args:
             transform: (4, 4).
-            source: (N, 3 or more), rows as in `unmatched_nll`.
-            target: (M, 3 or more).
+            source: tree of N points, rows as in `unmatched_nll`.
+            target: tree of M points.
 
         Returns:
             Mean over the points of each cloud, matched ones counting zero, and over the clouds;
@@ -69,13 +68,12 @@ class Hypotheses(NamedTuple):
         """
         if self.unmatched_nll is None:
             return 0.0
-        moved = source[:, :3] @ transform[:3, :3].T + transform[:3, 3]
-        clouds = (moved, target[:, :3]), (target[:, :3], moved)
-        means = []
-        for (points, other), nll in zip(clouds, self.unmatched_nll, strict=True):
-            distance, _ = KDTree(other).query(points, distance_upper_bound=MATCH_DISTANCE)
-            means.append(float(np.where(np.isinf(distance), nll, 0).mean()))
-        return sum(means) / 2
+        both = nearest_both_ways(source, target, transform, MATCH_DISTANCE)
+        means = [
+            np.where(np.isinf(distance), nll, 0).mean()
+            for (distance, _), nll in zip(both, self.unmatched_nll, strict=True)
+        ]
+        return float(np.mean(means))
 
     def support(self, transform: np.ndarray, source: np.ndarray, target: np.ndarray) -> float:
         """Compute the share of the matches, by weight, that support a transform; 1 without any.

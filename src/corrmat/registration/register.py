@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
+from scipy.spatial import KDTree
 from torch import nn
 
 from corrmat.calibration import Calibration, shipped_calibration, verdict
@@ -187,7 +188,10 @@ def measure(
     Returns:
         (T, 3): agreement, coherence, unmatched loss.
     """
-    rows = [(*scorer.alignment(t), hypotheses.unmatched_loss(t, *subsamples)) for t in transforms]
+    source, target = (KDTree(cloud[:, :3]) for cloud in subsamples)
+    rows = [
+        (*scorer.alignment(t), hypotheses.unmatched_loss(t, source, target)) for t in transforms
+    ]
     return np.array(rows)
 
 

@@ -116,8 +116,30 @@ class AlignmentScorer:
         Returns:
             Distances and indices: (N,) each for the source, (M,) each for the target.
         """
-        rotation, translation = transform[:3, :3], transform[:3, 3]
-        moved = self.source @ rotation.T + translation
-        back = (self.target - translation) @ rotation
-        queries = self._trees[1].query(moved), self._trees[0].query(back)
-        return [(np.asarray(distance), np.asarray(index)) for distance, index in queries]
+        return nearest_both_ways(*self._trees, transform)
+
+
+def nearest_both_ways(
+    source: KDTree, target: KDTree, transform: np.ndarray, max_distance: float = np.inf
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Find the nearest target point of every moved source point, and the other way round.
+
+    Args:
+        source: tree of N points.
+        target: tree of M points.
+        transform: (4, 4) of the source onto the target.
+        max_distance: where no point is nearer, the distance is infinite.
+
+    Returns:
+        Distances and indices: (N,) each for the source, (M,) each for the target.
+    """
+    rotation, translation = transform[:3, :3], transform[:3, 3]
+    moved = source.data @ rotation.T + translation
+    back = (target.data - translation) @ rotation
+    return [
+        (np.asarray(distance), np.asarray(index))
+        for distance, index in (
+            target.query(moved, distance_upper_bound=max_distance),
+            source.query(back, distance_upper_bound=max_distance),
+        )
+    ]

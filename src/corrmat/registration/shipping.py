@@ -112,6 +112,7 @@ def held_out_pairs(
         seed: of crops, noise and poses.
         points: of a cloud before it is cropped.
     """
+    # The shapes that the first runs held out. Later runs train on new ones alone.
     clouds = RegistrationDataModule(data="shapes+assemblies").clouds("val")
     families = np.flatnonzero([clouds.names[label] != "assembly" for label in clouds.labels])
     spread = np.linspace(0, len(families) - 1, min(count, len(families))).round().astype(int)

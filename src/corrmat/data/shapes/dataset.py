@@ -54,7 +54,7 @@ def load_assemblies(split: str, count: int | None = None, root: Path | None = No
 
 
 def load_rooms(split: str, count: int | None = None, root: Path | None = None) -> CloudSet:
-    """Load parts of furnished rooms; see `load`. Making them takes two minutes on two cores."""
+    """Load parts of furnished rooms; see `load`. Making them takes a minute on two cores."""
     return _load("rooms", split, count, ROOMS[split], (ROOM,), make_room)
 
 
