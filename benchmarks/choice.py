@@ -88,7 +88,7 @@ def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> Pair
         return np.array([benchmark.errors(pairs, index, t) for t in in_units])
 
     return PairTables(
-        np.stack([measure(each, hypotheses, subsamples, scorer) for each in refined]),
+        np.stack([measure(each, hypotheses, scorer) for each in refined]),
         np.stack([errors_of(each) for each in refined]),
         errors_of(truths),
         [matches_of(generate, count, subsamples).support(truth, *subsamples) for count in ANCHORS],

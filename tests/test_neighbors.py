@@ -74,6 +74,13 @@ def test_neighbors_at_ranks_are_those_of_knn(generator):
     assert torch.equal(neighbors_at_ranks(points, ranks), knn(points, 30)[..., ranks])
 
 
+def test_equally_near_points_come_in_the_order_of_the_cloud():
+    axes = torch.meshgrid(*[torch.arange(3.0)] * 3, indexing="ij")
+    grid = torch.stack(axes, -1).view(1, 27, 3)
+    expected = torch.cdist(grid, grid).argsort(dim=-1, stable=True)
+    assert torch.equal(neighbors_at_ranks(grid, torch.arange(27)), expected)
+
+
 def test_ranks_do_not_depend_on_where_the_cloud_lies(generator):
     points = torch.randn(1, 300, 3, generator=generator)
     ranks = torch.arange(8)

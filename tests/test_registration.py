@@ -12,7 +12,7 @@ import pytest
 import torch
 from conftest import random_rotation, shared
 from PIL import Image
-from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
 import corrmat
 from corrmat.calibration import verdict
@@ -561,12 +561,12 @@ def unmatched_loss(shift):
     """Of four points in a row, one apart, under a translation along it."""
     points = np.zeros((4, 3))
     points[:, 0] = range(4)
-    row = KDTree(points)
     nll = np.array([0.1, 0.2, 0.4, 0.8]), np.array([1.0, 2.0, 4.0, 8.0])
     hypotheses = Hypotheses(np.eye(4)[None], np.empty((0, 2), int), np.empty(0), None, nll)
     transform = rigid.to_homogeneous(np.eye(3), np.array([shift, 0, 0]))
-    assert hypotheses._replace(unmatched_nll=None).unmatched_loss(transform, row, row) == 0
-    return hypotheses.unmatched_loss(transform, row, row)
+    distances = AlignmentScorer(points, points).alignment(transform).distances
+    assert hypotheses._replace(unmatched_nll=None).unmatched_loss(distances) == 0
+    return hypotheses.unmatched_loss(distances)
 
 
 def test_only_a_network_with_matchabilities_says_which_points_have_no_match(generator):
@@ -585,6 +585,16 @@ def test_candidates_are_ranked_by_the_weighted_sum_of_their_measures():
     measures = np.array([[0.5, 0.1, 0.1], [0.6, 0.1, 0.5], [0.1, 0.0, 0.0], [0.5, 0.1, 0.1]])
     assert registration.ranking(measures, (10.0, -1.0)).tolist() == [0, 3, 1, 2]
     assert registration.ranking(measures, (0.0, 0.0)).tolist() == [1, 0, 3, 2]
+
+
+def test_a_transform_that_is_nearly_an_earlier_one_is_dropped():
+    def turned(angle, shift=0.0):
+        rotation = Rotation.from_euler("z", angle, degrees=True).as_matrix()
+        return rigid.to_homogeneous(rotation, np.array([shift, 0, 0]))
+
+    transforms = np.stack([turned(0), turned(3), turned(90), turned(90, 0.2), turned(92, 0.2)])
+    np.testing.assert_array_equal(registration.distinct(transforms), transforms[[0, 2, 3]])
+    np.testing.assert_array_equal(registration.distinct(transforms[:1]), transforms[:1])
 
 
 def test_the_best_of_the_refined_shortlist_is_chosen(pair, monkeypatch):

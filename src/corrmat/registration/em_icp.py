@@ -13,8 +13,7 @@ from torch import Tensor
 
 from corrmat.ops import rigid
 
-_WIDTHS = 0.1, 0.02  # standard deviation of the distance of a match, first and last
-_ITERATIONS = 10
+WIDTHS = np.geomspace(0.1, 0.02, 10)  # standard deviations of the distance of a match
 _PLANE = 0.9  # weight of the distance along the normals; the rest is that of the points
 _LEAST_PROB = 1e-3  # of any match: the network may be wrong
 _OUTLIER = 0.1  # weight of having no match, in units of `_LEAST_PROB`
@@ -22,12 +21,16 @@ _LOG_LEAST = -60.0  # exponents below would make denormal numbers, which are slo
 
 
 def em_icp(
-    transform: np.ndarray, source: np.ndarray, target: np.ndarray, prob: Tensor | None
+    transform: np.ndarray,
+    source: np.ndarray,
+    target: np.ndarray,
+    prob: Tensor | None,
+    widths: np.ndarray = WIDTHS,
 ) -> np.ndarray:
     """Refine a rigid transform of one cloud onto another.
 
-    Each iteration computes the weights W (N, M) of all matches, and then makes one Gauss-Newton
-    step on sum_ij W_ij (a (n_i (x_i - y_j))^2 + a (n_j (x_i - y_j))^2 + (1 - a) |x_i - y_j|^2),
+    For each width it computes the weights W (N, M) of all matches, and makes one Gauss-Newton step
+    on sum_ij W_ij (a (n_i (x_i - y_j))^2 + a (n_j (x_i - y_j))^2 + (1 - a) |x_i - y_j|^2),
     where x_i is a moved source point and n_i its normal.
 
     Args:
@@ -35,6 +38,7 @@ def em_icp(
         source: (N, 6), xyz and unit normals of any sign.
         target: (M, 6).
         prob: (N, M) probabilities of matches; None if all are equally likely.
+        widths: of the iterations, falling.
 
     Returns:
         (4, 4) float64.
@@ -52,7 +56,7 @@ def em_icp(
     on_planes = n_y * (n_y * y).sum(1, keepdim=True)
     terms = torch.cat([y.new_ones(len(y), 1), y, planes.flatten(1), on_planes], 1)
     identity = torch.eye(3, dtype=x.dtype)
-    for width in np.geomspace(*_WIDTHS, _ITERATIONS).tolist():
+    for width in widths.tolist():
         moved, normals = x @ rotation.T + translation, n_x @ rotation.T
         match = _closeness(moved, y, width).mul_((normals @ n_y.T).abs_()).mul_(prior)
         sums = _sums_over_matches(match, terms)

@@ -27,7 +27,6 @@ from corrmat.errors import CorrmatError
 from corrmat.ops import rigid
 from corrmat.ops.correspondence import MatchabilityCorrespondence, SoftCorrespondence
 from corrmat.ops.ransac import best_by_matches, best_distinct, fit_triples
-from corrmat.registration.scoring import nearest_both_ways
 from corrmat.types import MATCH_DISTANCE
 
 _STRONGEST = 256  # matches that RANSAC draws from
@@ -51,16 +50,15 @@ class Hypotheses(NamedTuple):
     # (N,) and (M,): -log of the probability that a source point, or a target point, has no match.
     unmatched_nll: tuple[np.ndarray, np.ndarray] | None = None
 
-    def unmatched_loss(self, transform: np.ndarray, source: KDTree, target: KDTree) -> float:
+    def unmatched_loss(self, distances: tuple[np.ndarray, np.ndarray]) -> float:
         """Compute the cross-entropy of the points that a transform leaves without a match.
 
         A wrong transform leaves points without a match that the network would match. This is the
         part of the training loss that labels such points, with the transform in the truth's place.
 
         Args:
-            transform: (4, 4).
-            source: tree of N points, rows as in `unmatched_nll`.
-            target: tree of M points.
+            distances: from each source point to the nearest target point under the transform, and
+                the other way round. The first N and M are those of `unmatched_nll`.
 
         Returns:
             Mean over the points of each cloud, matched ones counting zero, and over the clouds;
@@ -68,10 +66,9 @@ class Hypotheses(NamedTuple):
         """
         if self.unmatched_nll is None:
             return 0.0
-        both = nearest_both_ways(source, target, transform, MATCH_DISTANCE)
         means = [
-            np.where(np.isinf(distance), nll, 0).mean()
-            for (distance, _), nll in zip(both, self.unmatched_nll, strict=True)
+            np.where(distance[: len(nll)] > MATCH_DISTANCE, nll, 0).mean()
+            for distance, nll in zip(distances, self.unmatched_nll, strict=True)
         ]
         return float(np.mean(means))
 

@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy.spatial import KDTree
 from torch import nn
 
 from corrmat.calibration import Calibration, shipped_calibration, verdict
 from corrmat.data.normals import estimate_normals
 from corrmat.errors import CorrmatError
-from corrmat.registration.em_icp import em_icp
+from corrmat.registration.em_icp import WIDTHS, em_icp
 from corrmat.registration.hypotheses import (
     CLASSICAL,
     Hypotheses,
@@ -32,7 +31,8 @@ FULL_POINTS = 20_000  # to refine the selected one
 # A candidate scores agreement + these times coherence and unmatched loss; benchmarks/choice.py.
 CHOICE_WEIGHTS = 4.0, -1.0
 WITHOUT_MATCHABILITIES = 1.5, 0.0  # for models that have none: no unmatched loss
-SHORTLIST = 3  # best candidates, which EM-ICP refines before one is chosen
+SAME_TRANSFORM = 0.1  # difference of two matrices: a turn by 4 degrees, or a shift by 0.1
+SHORTLIST = 2  # best candidates, which EM-ICP refines before one is chosen
 SHORTLIST_POINTS = 400  # of either cloud, for that refinement
 MEDIAN = 0.6  # median distance from the centroid after scaling: a radius of about one
 NORMAL_TOLERANCE = 0.01  # by which the length of a given normal may differ from one
@@ -114,11 +114,11 @@ def register(
     weights = WITHOUT_MATCHABILITIES if hypotheses.unmatched_nll is None else CHOICE_WEIGHTS
 
     def ranked(transforms: np.ndarray) -> np.ndarray:
-        return transforms[ranking(measure(transforms, hypotheses, subsamples, scorer), weights)]
+        return transforms[ranking(measure(transforms, hypotheses, scorer), weights)]
 
     candidates = hypotheses.transforms
     if refine == "icp":
-        candidates = np.stack([scorer.refine(transform) for transform in candidates])
+        candidates = distinct(np.stack([scorer.refine(transform) for transform in candidates]))
     candidates = ranked(candidates)
     if refine == "icp":
         candidates = ranked(refine_shortlist(candidates[:SHORTLIST], hypotheses, subsamples))
@@ -171,27 +171,28 @@ def prepare_clouds(source: np.ndarray, target: np.ndarray, seed: int) -> Prepare
     return PreparedClouds((x, y), scale, subsamples, scorer)
 
 
-def measure(
-    transforms: np.ndarray,
-    hypotheses: Hypotheses,
-    subsamples: tuple[np.ndarray, np.ndarray],
-    scorer: AlignmentScorer,
-) -> np.ndarray:
+def distinct(transforms: np.ndarray) -> np.ndarray:
+    """Drop each transform that is nearly an earlier one: (T, 4, 4) to (D, 4, 4)."""
+    kept = transforms[:1]
+    for transform in transforms[1:]:
+        if np.linalg.norm(kept - transform, axis=(1, 2)).min() > SAME_TRANSFORM:
+            kept = np.concatenate([kept, transform[None]])
+    return kept
+
+
+def measure(transforms: np.ndarray, hypotheses: Hypotheses, scorer: AlignmentScorer) -> np.ndarray:
     """Measure what the choice among transforms weighs.
 
     Args:
         transforms: (T, 4, 4).
         hypotheses: of the model.
-        subsamples: the clouds that they were made from.
-        scorer: of the clouds to measure the transforms on.
+        scorer: of the clouds to measure the transforms on; the model had their first points.
 
     Returns:
         (T, 3): agreement, coherence, unmatched loss.
     """
-    source, target = (KDTree(cloud[:, :3]) for cloud in subsamples)
-    rows = [
-        (*scorer.alignment(t), hypotheses.unmatched_loss(t, source, target)) for t in transforms
-    ]
+    found = [scorer.alignment(transform) for transform in transforms]
+    rows = [(a.agreement, a.coherence, hypotheses.unmatched_loss(a.distances)) for a in found]
     return np.array(rows)
 
 
@@ -224,9 +225,9 @@ def refine_chosen(
 ) -> np.ndarray:
     """Refine the chosen transform (4, 4) on all of the model's points, by EM-ICP.
 
-    If the shortlist was refined on as many points, that has been done. Generalised ICP follows
-    where it is more exact: on points that the model has not seen, and on points that both clouds
-    share.
+    If the shortlist was refined on as many points, that has been done. Else the last iterations
+    are enough. Generalised ICP follows where it is more exact: on points that the model has not
+    seen, and on points that both clouds share.
 
     Args:
         transform: of the source onto the target.
@@ -235,7 +236,7 @@ def refine_chosen(
         full: scorer of the clouds, with all their points.
     """
     if max(map(len, subsamples)) > SHORTLIST_POINTS:
-        transform = em_icp(transform, *subsamples, hypotheses.prob)
+        transform = em_icp(transform, *subsamples, hypotheses.prob, WIDTHS[-4:])
     more = max(len(full.source), len(full.target)) > MODEL_POINTS
     return full.refine(transform) if more or full.shares_points(transform) else transform
 

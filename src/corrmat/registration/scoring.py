@@ -8,23 +8,27 @@ import small_gicp
 from scipy.spatial import KDTree
 
 from corrmat.data.normals import NEIGHBORS
+from corrmat.types import MATCH_DISTANCE
 
 _SAME = 0.02  # of `max_distance`: points that lie nearer than this are one point
 _SHARED = 0.1  # share of the source's points that are the target's, too
 
 
 class Alignment(NamedTuple):
-    """How well two clouds lie on each other; both numbers are means over the two clouds.
+    """How well two clouds lie on each other; agreement and coherence are means over the clouds.
 
     agreement: in [0, 1]. A point counts the more, the nearer the nearest point of the other cloud
         is and the more parallel their normals are, whose signs are unknown.
     coherence: in [0, 0.25], the variance of "has a near point in the other cloud" that a linear
         function of the position explains. Two scans of one thing share a region, so that under
         the true transform the near points lie on one side; under a wrong one they are scattered.
+    distances: (N,) and (M,), from each source point to the nearest target point, and the other way
+        round; infinite beyond what counts as near.
     """
 
     agreement: float
     coherence: float
+    distances: tuple[np.ndarray, np.ndarray]
 
 
 class AlignmentScorer:
@@ -91,7 +95,8 @@ class AlignmentScorer:
             agreements.append(closeness @ np.abs((a * b).sum(1)) / len(d))
             near = d < self.max_distance
             coherences.append(np.square((near - near.mean()) @ axes).sum() / len(d))
-        return Alignment(float(np.mean(agreements)), float(np.mean(coherences)))
+        agreement, coherence = float(np.mean(agreements)), float(np.mean(coherences))
+        return Alignment(agreement, coherence, (distance, back_distance))
 
     @functools.cached_property
     def _axes(self) -> tuple[np.ndarray, np.ndarray]:
@@ -114,32 +119,17 @@ class AlignmentScorer:
         """Find the nearest target point of every source point, and the other way round.
 
         Returns:
-            Distances and indices: (N,) each for the source, (M,) each for the target.
+            Distances and indices: (N,) each for the source, (M,) each for the target. Where no
+            point is near, the distance is infinite and the index is of any point.
         """
-        return nearest_both_ways(*self._trees, transform)
+        rotation, translation = transform[:3, :3], transform[:3, 3]
+        source, target = self._trees
+        moved = source.data @ rotation.T + translation
+        back = (target.data - translation) @ rotation
+        return [self._query(target, moved), self._query(source, back)]
 
-
-def nearest_both_ways(
-    source: KDTree, target: KDTree, transform: np.ndarray, max_distance: float = np.inf
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Find the nearest target point of every moved source point, and the other way round.
-
-    Args:
-        source: tree of N points.
-        target: tree of M points.
-        transform: (4, 4) of the source onto the target.
-        max_distance: where no point is nearer, the distance is infinite.
-
-    Returns:
-        Distances and indices: (N,) each for the source, (M,) each for the target.
-    """
-    rotation, translation = transform[:3, :3], transform[:3, 3]
-    moved = source.data @ rotation.T + translation
-    back = (target.data - translation) @ rotation
-    return [
-        (np.asarray(distance), np.asarray(index))
-        for distance, index in (
-            target.query(moved, distance_upper_bound=max_distance),
-            source.query(back, distance_upper_bound=max_distance),
-        )
-    ]
+    def _query(self, tree: KDTree, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Find the nearest point of a tree to each of `points`; see `_nearest`."""
+        farthest = max(self.max_distance, MATCH_DISTANCE)
+        distance, index = tree.query(points, distance_upper_bound=farthest)
+        return np.asarray(distance), np.minimum(index, tree.n - 1)
