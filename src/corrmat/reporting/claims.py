@@ -29,7 +29,6 @@ from corrmat.reporting.tables import markdown_head, markdown_row, paper_metric, 
 
 Verdict = Literal["confirmed", "confirmed in direction", "not shown", "contradicted"]
 LEFT_BASELINE = 0.5  # of identity's median error: an arm above it has learnt nothing to compare
-FAIR_SHARE = 1.5  # METHOD_corr may see so many times METHOD's pairs; more, and it shows nothing
 NEAR_PAPER = 0.5  # of the paper's ratio: less is a confirmation of the direction only
 FLAT = 2.0  # growth of the error from the first to the last band of table 1
 STILL_LEARNING = 0.01  # gain of matches over the last quarter of a training that had not ended
@@ -75,13 +74,6 @@ class Evidence:
         seed = f", seed {self.record.seed}" if self.record.seed else ""
         return f"{self.record.scale}, {self.record.data}{seed}"
 
-    def times_the_pairs(self, opponent: str) -> float:
-        """Compute METHOD_corr's training pairs for each one of another arm; 1 if not recorded."""
-        theirs, ours = (
-            self.record.arms[arm].pairs_seen for arm in (opponent, self.record.treatment)
-        )
-        return ours / theirs if theirs and ours else 1.0
-
     def left_identity(self, errors: PairErrors) -> bool:
         """Tell whether an arm is clearly better than guessing the identity."""
         return errors.median_deg < LEFT_BASELINE * self.identity_median_deg
@@ -97,22 +89,19 @@ def read_evidence(record: Record, results: Path) -> Evidence:
     return Evidence(record, read_errors(folder / "per_pair.csv"), largest / 2)
 
 
-def verdict_of_ratio(
-    ratio: Estimate, paper: float | None, baseline_learnt: bool, times_the_pairs: float = 1.0
-) -> Verdict:
+def verdict_of_ratio(ratio: Estimate, paper: float | None, baseline_learnt: bool) -> Verdict:
     """Judge "METHOD_corr errs less than METHOD".
 
     Args:
         ratio: of METHOD's median error to METHOD_corr's.
         paper: the same ratio in the paper; None if it gives none.
         baseline_learnt: whether METHOD left the identity guess; else it shows nothing.
-        times_the_pairs: training pairs of METHOD_corr for each of METHOD; far more show nothing.
     """
     if not baseline_learnt:
         return "not shown"
     if ratio.high < 1:
         return "contradicted"
-    if ratio.low <= 1 or times_the_pairs > FAIR_SHARE:
+    if ratio.low <= 1:
         return "not shown"
     near = paper is not None and ratio.value >= NEAR_PAPER * paper
     return "confirmed" if near else "confirmed in direction"
@@ -133,15 +122,12 @@ def less_error(evidence: Evidence) -> Claim:
     if not learnt:
         identity = f"{evidence.identity_median_deg:g} deg"
         ours += f"; {record.baseline} errs by at least half of the identity guess's {identity}"
-    times = evidence.times_the_pairs(str(record.baseline))
-    if times > FAIR_SHARE:
-        ours += f"; {record.treatment} saw {times:.3g} times as many pairs"
     return Claim(
         f"{record.id}: {record.treatment} registers better than {record.baseline} ({record.title})",
         f"{theirs[0]:.3g} → {theirs[1]:.3g} deg: {paper_ratio:.3g} times" if paper_ratio else "",
         ours,
         evidence.where,
-        verdict_of_ratio(ratio, paper_ratio, learnt, times),
+        verdict_of_ratio(ratio, paper_ratio, learnt),
     )
 
 
@@ -178,7 +164,7 @@ def sooner(evidence: Evidence) -> Claim | None:
     verdict: Verdict = "confirmed" if share <= 0.5 else "confirmed in direction"
     at_once = needed == treatment.curve[0]["pairs_seen"]
     if share >= 1:
-        verdict = "not shown" if at_once else "contradicted"
+        verdict = "contradicted"
     if not evidence.left_identity(evidence.baseline):
         verdict = "not shown"
     reached = "never" if math.isinf(needed) else f"after {needed:,.0f}"
@@ -253,12 +239,7 @@ def loss_not_rate(evidence: Evidence) -> Claim | None:
         f"{as_text(median_rotation(evidence.errors[control]), 'deg')} → "
         f"{as_text(median_rotation(evidence.treatment), 'deg')}: {as_text(ratio)} times",
         evidence.where,
-        verdict_of_ratio(
-            ratio,
-            None,
-            evidence.left_identity(evidence.errors[control]),
-            evidence.times_the_pairs(control),
-        ),  # fmt: skip
+        verdict_of_ratio(ratio, None, evidence.left_identity(evidence.errors[control])),
     )
 
 
