@@ -24,8 +24,10 @@ from corrmat.registration import benchmark
 from corrmat.registration.em_icp import em_icp
 from corrmat.registration.hypotheses import Hypotheses, NetworkHypotheses
 from corrmat.registration.register import (
+    CANDIDATE_STEPS,
     CHOICE_WEIGHTS,
     SHORTLIST,
+    distinct,
     measure,
     prepare_clouds,
     ranking,
@@ -53,8 +55,8 @@ _SEED = 5  # of pairs that nothing else uses
 class PairTables(NamedTuple):
     """What the candidates of a pair are worth; the last of them is the true transform."""
 
-    measures: np.ndarray  # (2, T + 1, 3) agreement, coherence, unmatched loss; see `errors`
-    errors: np.ndarray  # (2, T + 1, 2) degrees and ADD-S, after generalised ICP, then EM-ICP
+    measures: np.ndarray  # (2, T + 1, 3) agreement, coherence, unmatched loss; after EM-ICP, too
+    errors: np.ndarray  # (2, T + 1, 2) degrees and ADD-S, after generalised ICP and after EM-ICP
     refined_truth: np.ndarray  # (2, 2) the same of the truth after EM-ICP alone, as `PRIORS`
     right_matches: list[float]  # share of the matches, by weight, for each of `ANCHORS`
 
@@ -78,9 +80,10 @@ def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> Pair
     hypotheses = generate(*subsamples, 0)
     rotation, translation = pairs.rotation[index].double().numpy(), pairs.translation[index].numpy()
     truth = rigid.to_homogeneous(rotation, scale * (rotation @ x.centre + translation - y.centre))
-    start = [*hypotheses.transforms, truth]
-    gicp = np.stack([scorer.refine(transform) for transform in start])
-    refined = gicp, refine_shortlist(gicp, hypotheses, subsamples)
+    start = [scorer.refine(each, CANDIDATE_STEPS) for each in (*hypotheses.transforms, truth)]
+    candidates = np.stack([*distinct(np.stack(start[:-1])), start[-1]])
+    gicp = np.stack([scorer.refine(each) for each in candidates])
+    em = refine_shortlist(candidates, hypotheses, subsamples)
     truths = [em_icp(truth, *subsamples, prior) for prior in (None, hypotheses.prob)]
 
     def errors_of(transforms: Iterable[np.ndarray]) -> np.ndarray:
@@ -88,8 +91,8 @@ def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> Pair
         return np.array([benchmark.errors(pairs, index, t) for t in in_units])
 
     return PairTables(
-        np.stack([measure(each, hypotheses, scorer) for each in refined]),
-        np.stack([errors_of(each) for each in refined]),
+        np.stack([measure(each, hypotheses, scorer) for each in (candidates, em)]),
+        np.stack([errors_of(each) for each in (gicp, em)]),
         errors_of(truths),
         [matches_of(generate, count, subsamples).support(truth, *subsamples) for count in ANCHORS],
     )

@@ -31,6 +31,7 @@ FULL_POINTS = 20_000  # to refine the selected one
 # A candidate scores agreement + these times coherence and unmatched loss; benchmarks/choice.py.
 CHOICE_WEIGHTS = 4.0, -1.0
 WITHOUT_MATCHABILITIES = 1.5, 0.0  # for models that have none: no unmatched loss
+CANDIDATE_STEPS = 5  # of generalised ICP, for each candidate; EM-ICP goes on from there
 SAME_TRANSFORM = 0.1  # difference of two matrices: a turn by 4 degrees, or a shift by 0.1
 SHORTLIST = 2  # best candidates, which EM-ICP refines before one is chosen
 SHORTLIST_POINTS = 400  # of either cloud, for that refinement
@@ -118,7 +119,7 @@ def register(
 
     candidates = hypotheses.transforms
     if refine == "icp":
-        candidates = distinct(np.stack([scorer.refine(transform) for transform in candidates]))
+        candidates = distinct(np.stack([scorer.refine(t, CANDIDATE_STEPS) for t in candidates]))
     candidates = ranked(candidates)
     if refine == "icp":
         candidates = ranked(refine_shortlist(candidates[:SHORTLIST], hypotheses, subsamples))

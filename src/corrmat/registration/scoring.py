@@ -61,7 +61,7 @@ class AlignmentScorer:
         source, target, _ = self._clouds
         return np.asarray(source.normals())[:, :3], np.asarray(target.normals())[:, :3]
 
-    def refine(self, transform: np.ndarray) -> np.ndarray:
+    def refine(self, transform: np.ndarray, iterations: int = 30) -> np.ndarray:
         """Refine a transform (4, 4) by generalised ICP (Segal et al., RSS 2009)."""
         source, target, tree = self._clouds
         result = small_gicp.align(
@@ -71,7 +71,7 @@ class AlignmentScorer:
             transform,
             registration_type="GICP",
             max_correspondence_distance=self.max_distance,
-            max_iterations=30,
+            max_iterations=iterations,
         )
         return np.asarray(result.T_target_source)
 
