@@ -31,6 +31,7 @@ from corrmat.registration.register import (
     measure,
     prepare_clouds,
     ranking,
+    refine_chosen,
     refine_shortlist,
     to_original_units,
 )
@@ -57,11 +58,12 @@ class PairTables(NamedTuple):
 
     measures: np.ndarray  # (2, T + 1, 3) agreement, coherence, unmatched loss; after EM-ICP, too
     errors: np.ndarray  # (2, T + 1, 2) degrees and ADD-S, after generalised ICP and after EM-ICP
+    candidates: int  # before copies are dropped
     refined_truth: np.ndarray  # (2, 2) the same of the truth after EM-ICP alone, as `PRIORS`
     right_matches: list[float]  # share of the matches, by weight, for each of `ANCHORS`
 
     def choose(self, weights: tuple[float, float], shortlist: int, truth: bool = False) -> int:
-        """Choose among all that EM-ICP refines of the best candidates before it.
+        """Choose the best of the shortlist after EM-ICP.
 
         Args:
             weights: of coherence and unmatched loss.
@@ -84,6 +86,7 @@ def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> Pair
     candidates = np.stack([*distinct(np.stack(start[:-1])), start[-1]])
     gicp = np.stack([scorer.refine(each) for each in candidates])
     em = refine_shortlist(candidates, hypotheses, subsamples)
+    final = [refine_chosen(each, hypotheses, subsamples, scorer) for each in em]
     truths = [em_icp(truth, *subsamples, prior) for prior in (None, hypotheses.prob)]
 
     def errors_of(transforms: Iterable[np.ndarray]) -> np.ndarray:
@@ -92,7 +95,8 @@ def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> Pair
 
     return PairTables(
         np.stack([measure(each, hypotheses, scorer) for each in (candidates, em)]),
-        np.stack([errors_of(each) for each in (gicp, em)]),
+        np.stack([errors_of(each) for each in (gicp, final)]),
+        len(hypotheses.transforms),
         errors_of(truths),
         [matches_of(generate, count, subsamples).support(truth, *subsamples) for count in ANCHORS],
     )
@@ -151,7 +155,8 @@ def main() -> None:
         means = np.mean([table.right_matches for table in tables], 0).round(4).tolist()
         content[protocol] = {
             "pairs": len(tables),
-            "candidates": float(np.mean([len(table.errors[0]) - 1 for table in tables])),
+            "candidates": float(np.mean([table.candidates for table in tables])),
+            "distinct": float(np.mean([len(table.errors[0]) - 1 for table in tables])),
             "weights": {name: shares([row[name] for row in rows]) for name in rows[0]},
             "right_matches": dict(zip(map(str, ANCHORS), means, strict=True)),
         }

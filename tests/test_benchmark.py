@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from corrmat.cli import main
 from corrmat.data import registry
-from corrmat.data.rooms import OVERLAP, make_room_pair
+from corrmat.data.room_pairs import OVERLAP, make_room_pair
 from corrmat.errors import CorrmatError
 from corrmat.registration import benchmark, shipping
 from corrmat.reporting import comparisons

@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 
 from corrmat.data.pairs import STREAM, Key, PairSettings, Split, make_pairs
 from corrmat.data.registry import load_clouds
-from corrmat.data.rooms import make_room_pair
+from corrmat.data.room_pairs import make_room_pair
 from corrmat.errors import CorrmatError
 from corrmat.files import replace_text
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG, rotation_error_deg

@@ -31,7 +31,8 @@ FULL_POINTS = 20_000  # to refine the selected one
 # A candidate scores agreement + these times coherence and unmatched loss; benchmarks/choice.py.
 CHOICE_WEIGHTS = 4.0, -1.0
 WITHOUT_MATCHABILITIES = 1.5, 0.0  # for models that have none: no unmatched loss
-CANDIDATE_STEPS = 5  # of generalised ICP, for each candidate; EM-ICP goes on from there
+CANDIDATE_STEPS = 5  # of generalised ICP, for each candidate; EM-ICP with matches does the rest
+WITHOUT_MATCHES = 30  # the same for models that have none
 SAME_TRANSFORM = 0.1  # difference of two matrices: a turn by 4 degrees, or a shift by 0.1
 SHORTLIST = 2  # best candidates, which EM-ICP refines before one is chosen
 SHORTLIST_POINTS = 400  # of either cloud, for that refinement
@@ -77,8 +78,8 @@ def register(
     """Find the rigid transform that takes the source onto the target.
 
     The clouds may be in any units, overlap in part, share no point, and have outliers. Stray
-    points, more than thirty times as far out as half of the cloud, are left out. The same points
-    in any order, with the same seed, give the same matrix.
+    points, more than thirty median distances from the middle, are left out. The same points in any
+    order, with the same seed, give the same matrix.
 
     Args:
         source: (N, 3), or (N, 6) with unit normals.
@@ -86,7 +87,8 @@ def register(
         model: "corrmat" for the shipped weights; "icp", or where they are installed "ransac",
             "ransac17", "fgr" or "kiss", for the classical pipelines; whatever else `load_model`
             takes; or a network, or a method, of your own.
-        refine: "icp" after the model, see `refine_chosen`; or "none".
+        refine: "icp": generalised ICP of all candidates of the model, EM-ICP of the best; or
+            "none": the candidates as they are.
         seed: of subsampling and of the model's random draws.
 
     Returns:
@@ -119,7 +121,8 @@ def register(
 
     candidates = hypotheses.transforms
     if refine == "icp":
-        candidates = distinct(np.stack([scorer.refine(t, CANDIDATE_STEPS) for t in candidates]))
+        steps = WITHOUT_MATCHES if hypotheses.prob is None else CANDIDATE_STEPS
+        candidates = distinct(np.stack([scorer.refine(t, steps) for t in candidates]))
     candidates = ranked(candidates)
     if refine == "icp":
         candidates = ranked(refine_shortlist(candidates[:SHORTLIST], hypotheses, subsamples))
