@@ -27,6 +27,7 @@ from corrmat.registration.register import (
     CANDIDATE_STEPS,
     CHOICE_WEIGHTS,
     SHORTLIST,
+    WITHOUT_MATCHES,
     distinct,
     measure,
     prepare_clouds,
@@ -75,14 +76,23 @@ class PairTables(NamedTuple):
         return int(best[ranking(after[best], weights)[0]])
 
 
-def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> PairTables:
-    """Refine and measure the candidates of a pair, and the true transform in the same way."""
+def tables_of(
+    pairs: PairBatch, index: int, generate: NetworkHypotheses, steps: int = CANDIDATE_STEPS
+) -> PairTables:
+    """Refine and measure the candidates of a pair, and the true transform in the same way.
+
+    Args:
+        pairs: of a protocol.
+        index: of the pair.
+        generate: the model.
+        steps: of generalised ICP for each candidate.
+    """
     source, target = (c[index].double().numpy() for c in (pairs.source, pairs.target))
     (x, y), scale, subsamples, scorer = prepare_clouds(source, target, 0)
     hypotheses = generate(*subsamples, 0)
     rotation, translation = pairs.rotation[index].double().numpy(), pairs.translation[index].numpy()
     truth = rigid.to_homogeneous(rotation, scale * (rotation @ x.centre + translation - y.centre))
-    start = [scorer.refine(each, CANDIDATE_STEPS) for each in (*hypotheses.transforms, truth)]
+    start = [scorer.refine(each, steps) for each in (*hypotheses.transforms, truth)]
     candidates = np.stack([*distinct(np.stack(start[:-1])), start[-1]])
     gicp = np.stack([scorer.refine(each) for each in candidates])
     em = refine_shortlist(candidates, hypotheses, subsamples)
@@ -115,13 +125,15 @@ def matches_of(
         network.test_anchors = usual
 
 
-def outcomes(table: PairTables) -> dict[str, np.ndarray]:
+def outcomes(table: PairTables, more_steps: PairTables) -> dict[str, np.ndarray]:
     """Return the errors (2,) of one pair for all weights and refinements."""
     gicp, em = table.errors
     rows = {f"{a}, {b}": em[table.choose((a, b), 1)] for a, b in TRIED}
     for shortlist in (SHORTLIST, 2 * SHORTLIST):
         name = f"in use, {shortlist} candidates refined by EM-ICP before the choice"
         rows[name] = em[table.choose(CHOICE_WEIGHTS, shortlist)]
+    name = f"in use, {WITHOUT_MATCHES} steps of generalised ICP for each candidate"
+    rows[name] = more_steps.errors[1][more_steps.choose(CHOICE_WEIGHTS, SHORTLIST)]
     rows["best candidate"] = em[:-1].min(0)
     with_truth = table.choose(CHOICE_WEIGHTS, SHORTLIST, truth=True)
     rows["in use, the truth among the candidates"] = em[with_truth]
@@ -147,11 +159,14 @@ def main() -> None:
     content: dict[str, object] = {"commit": commit(), "points": 512}
     for protocol, count in PAIRS.items():
         pairs = held_out_pairs(protocol, count, _SEED)
-        tables = [
-            tables_of(pairs, index, generate)
+        both = [
+            [
+                tables_of(pairs, index, generate, steps)
+                for steps in (CANDIDATE_STEPS, WITHOUT_MATCHES)
+            ]
             for index in track(range(len(pairs)), protocol, transient=True)
         ]
-        rows = [outcomes(table) for table in tables]
+        rows, tables = [outcomes(*pair) for pair in both], [pair[0] for pair in both]
         means = np.mean([table.right_matches for table in tables], 0).round(4).tolist()
         content[protocol] = {
             "pairs": len(tables),

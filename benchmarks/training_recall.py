@@ -35,13 +35,15 @@ def git(*words: str) -> bytes:
 def extract_weights(folder: Path) -> dict[int, Path]:
     """Write the newest weights of each number of training pairs into a folder."""
     found: dict[int, Path] = {}
-    for number, commit in enumerate(git("log", "--format=%H", "--", WEIGHTS).decode().split()):
+    commits = git("log", "--format=%H", "--", WEIGHTS).decode().split()
+    for number, commit in enumerate(["", *commits]):
         path = folder / f"{number}.safetensors"
-        path.write_bytes(git("show", f"{commit}:{WEIGHTS}"))
+        current = (ROOT / WEIGHTS).read_bytes
+        path.write_bytes(git("show", f"{commit}:{WEIGHTS}") if commit else current())
         with safetensors.safe_open(path, framework="pt") as file:
             pairs = (file.metadata() or {}).get("pairs")
         if pairs is None:
-            break  # weights of before did not say
+            break  # older weights do not say
         found.setdefault(int(pairs), path)
     return found
 

@@ -1,6 +1,7 @@
 """The ledger of claims: intervals from pairs, and verdicts by the rule."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -98,14 +99,18 @@ def test_sooner_counts_the_pairs_to_the_others_best_error():
             for i, v in enumerate(values)
         ]
 
-    for treatment, verdict in (
-        (curve(9, 3, 2, 1), "confirmed"),
-        (curve(9, 8, 3, 1), "confirmed in direction"),
-        (curve(9, 8, 7, 6), "contradicted"),
+    for baseline, treatment, verdict in (
+        (curve(9, 8, 7, 4), curve(9, 3, 2, 1), "confirmed"),
+        (curve(9, 8, 7, 4), curve(9, 8, 3, 1), "confirmed in direction"),
+        (curve(9, 8, 7, 4), curve(9, 8, 7, 4), "not shown"),
+        (curve(9, 8, 7, 4), curve(9, 8, 7, 6), "contradicted"),
+        (
+            curve(9, 4, math.nan, 80),
+            curve(9, 8, 3, 1),
+            "contradicted",
+        ),  # diverged
     ):
-        judged = claims.sooner(
-            evidence(drawn(6.0), drawn(0.3), curves=(curve(9, 8, 7, 4), treatment))
-        )
+        judged = claims.sooner(evidence(drawn(6.0), drawn(0.3), curves=(baseline, treatment)))
         assert judged.verdict == verdict
 
 
@@ -119,9 +124,9 @@ def test_a_curve_with_errors_that_are_no_numbers_or_without_a_point():
         faster = [{"pairs_seen": 100.0, "rotation_error_deg_mean": 1.0}]
         seen = evidence(drawn(6.0), drawn(0.3), curves=(values, faster))
         assert claims.sooner(seen).verdict == "confirmed"
-        seen.record.controls.append("DCP_high_rate")
-        seen.record.arms["DCP_high_rate"] = ArmResult({}, curve=values)
-        seen.errors["DCP_high_rate"] = drawn(3.0)
+        seen.record.controls.append(claims.HIGH_RATE_CONTROL)
+        seen.record.arms[claims.HIGH_RATE_CONTROL] = ArmResult({}, curve=values)
+        seen.errors[claims.HIGH_RATE_CONTROL] = drawn(3.0)
         assert claims.unstable_at_high_rates(seen).verdict == "confirmed"
     assert claims.sooner(evidence(drawn(6.0), drawn(0.3))) is None
 

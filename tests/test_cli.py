@@ -203,3 +203,5 @@ def test_a_checkpoint_of_another_scale_is_named(tmp_path, capsys):
     options = ["--data.train_shapes", "20", "--data.test_shapes", "8"]
     assert main(["evaluate", *words, *options]) == 2
     assert "there is one of --scale smoke" in capsys.readouterr().err
+    assert main(["evaluate", *words, *options, "--seed", "1"]) == 2
+    assert "train first" in capsys.readouterr().err

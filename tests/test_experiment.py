@@ -31,7 +31,7 @@ from corrmat.registration import benchmark
 from corrmat.reporting.page import build_page
 from corrmat.reporting.record import Record, read_snapshots
 from corrmat.training import callbacks, console, experiment, fit, hardware, recipe
-from corrmat.training.preflight import prepare
+from corrmat.training.preflight import planned_steps, prepare
 
 IDS = [path.stem for path in sorted((ROOT / "configs" / "exp").glob("*.yaml"))]
 
@@ -249,7 +249,7 @@ def test_ctrl_c_and_the_same_command_end_as_if_nothing_had_been(
         press_ctrl_c(during, step, patch)
         train(settings, folder)
     assert stopped.value.code == 1
-    assert "the same command continues from there" in capsys.readouterr().out
+    assert "the same command, without --fresh, continues from there" in capsys.readouterr().out
     assert not (folder / "trained.json").exists()
     signal.signal(signal.SIGINT, signal.default_int_handler)  # Lightning leaves it ignored
     trained = train(settings, folder)
@@ -308,6 +308,9 @@ def test_other_settings_do_not_go_on_from_an_old_checkpoint(tmp_path, capsys):
     train(settings, tmp_path / "DCP")
     assert "continuing" not in capsys.readouterr().out
     assert (tmp_path / "DCP.previous" / "last.ckpt").read_bytes() == old  # nothing is lost
+    train(load("1.1", "--optimizer.lr", "2e-4").arms["DCP"], tmp_path / "DCP")
+    assert (tmp_path / "DCP.previous" / "last.ckpt").read_bytes() == old
+    assert (tmp_path / "DCP.previous2" / "best.ckpt").is_file()
 
 
 @pytest.mark.parametrize(("lacking", "same"), [("new_shapes", True), ("num_points", False)])
@@ -567,6 +570,15 @@ def test_a_machine_that_is_fast_in_bfloat16_trains_in_it(arm, tmp_path, monkeypa
 def test_a_test_runs_on_the_first_device_that_is_named(devices, count, one):
     assert hardware.count_devices(devices) == count
     assert hardware.first_device(devices) == one
+
+
+def test_a_cycle_that_would_rise_in_one_step_is_refused_before_anything_is_deleted():
+    arm = prepare(load("1.1", "--trainer.max_epochs", "3").arms["DCP"])
+    batches = len(arm.datamodule.train_dataloader())
+    assert planned_steps(arm) == 3 * batches
+    options = "--trainer.max_epochs", "1", "--trainer.limit_train_batches", "10"
+    with pytest.raises(CorrmatError, match="cannot rise in one step"):
+        prepare(load("1.1", *options, "--optimizer.warmup", "0.1").arms["DCP"])
 
 
 def test_checkpoints_reload_to_the_same_network(tmp_path):

@@ -184,6 +184,17 @@ def test_layers_lie_over_each_other(tmp_path):
     assert recipe.load(path, "smoke").paper == {}
 
 
+def test_what_an_experiment_is_called_and_whose_networks_it_tests_is_no_bases_to_say(tmp_path):
+    path = tmp_path / "x.yaml"
+    base = ROOT / "configs" / "exp" / "1.4.yaml"
+    path.write_text(f"base: {base}\n")
+    with pytest.raises(CorrmatError, match="lacks 'id'"):  # it would write over the record of 1.4
+        recipe.load(path, "smoke")
+    path.write_text(f"base: {base}\nid: x\nnetworks_of: null\n")
+    assert recipe.load(base, "smoke").networks_of == "1.1"
+    assert recipe.load(path, "smoke").networks_of is None
+
+
 def test_a_recipe_names_its_baseline_treatment_and_controls(tmp_path):
     path = tmp_path / "x.yaml"
     arms = "arms: {A: {method: DCP}, B: {method: DCP_corr}, C: {method: DCP}}\n"

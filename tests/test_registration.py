@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import random_rotation, shared
+from matplotlib.text import Text
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -25,6 +26,7 @@ from corrmat.ops import rigid
 from corrmat.ops.correspondence import MatchabilityCorrespondence, SoftCorrespondence
 from corrmat.registration import example
 from corrmat.registration import register as registration
+from corrmat.registration.animation import registration_gif
 from corrmat.registration.hypotheses import Hypotheses, rough_agreement, unmatched_nll
 from corrmat.registration.scene import build_scene, extent
 from corrmat.registration.scoring import AlignmentScorer
@@ -105,7 +107,7 @@ def test_detail_far_from_the_origin_is_not_lost():
     """Millimetres at coordinates of 1e7: the moved source meets the target to float64."""
     rng = np.random.default_rng(0)
     points = make_shape(("test", 3))[0][:, :3].astype(np.float64)
-    rotation = registration_rotation(rng)
+    rotation = drawn_rotation(rng)
     source = 1000 * points + 1e7
     target = (1000 * points) @ rotation.T - 1e7
     result = corrmat.register(source, target)
@@ -162,6 +164,16 @@ def test_the_default_precision_does_not_matter(pair):
     np.testing.assert_allclose(result.transform, expected.transform, atol=1e-6, rtol=1e-6)
 
 
+def test_a_network_in_half_precision_gives_a_rigid_transform(pair):
+    _, source, target, _ = pair
+    network = load_model().to(torch.bfloat16)
+    for refine in ("icp", "none"):
+        transform = corrmat.register(source, target, model=network, refine=refine).transform
+        assert np.isfinite(transform).all()
+    rotation = corrmat.register(source, target, model=network).transform[:3, :3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
+
+
 @pytest.mark.parametrize("model", ["icp", "corrmat"])
 def test_shapes_that_have_nothing_in_common_are_not_called_aligned(pair, model):
     rng = np.random.default_rng(0)
@@ -180,7 +192,7 @@ def test_a_stray_point_does_not_shrink_the_picture(pair):
     assert (high - low).max() < 3 * np.ptp(target, axis=0).max()
 
 
-def registration_rotation(rng):
+def drawn_rotation(rng):
     q, r = np.linalg.qr(rng.normal(size=(3, 3)))
     q = q * np.sign(np.diag(r))
     return q * np.linalg.det(q)
@@ -253,6 +265,16 @@ def test_many_points_are_subsampled_evenly():
     assert len(set(actual.rows.tolist())) == registration.FULL_POINTS
     assert np.abs(actual.centre).max() < 0.03
     assert abs(np.median(actual.rows) - 50_000) < 1500  # from everywhere in the file
+
+
+@pytest.mark.parametrize(("model", "said"), [("icp", 0), ("corrmat", 13)])
+def test_the_animation_speaks_of_matches_where_there_are_some(pair, model, said, monkeypatch):
+    titles = []
+    original = Text.set_text
+    monkeypatch.setattr(Text, "set_text", lambda t, s: (titles.append(str(s)), original(t, s))[1])
+    _, source, target, _ = pair
+    registration_gif(corrmat.register(source, target, model=model), source, target)
+    assert sum("of the matches" in title for title in titles) == said
 
 
 def test_the_command_writes_what_it_promises(pair, tmp_path, capsys):

@@ -112,7 +112,7 @@ def test_sigterm_saves_and_says_how_to_go_on(tmp_path):
     said, _ = process.communicate(timeout=60)
     assert process.returncode == 1
     assert (tmp_path / "runs/smoke/shapes/1.1/DCP_corr/last.ckpt").exists()
-    assert "the same command continues from there" in said
+    assert "the same command, without --fresh, continues from there" in said
     assert "Traceback" not in said
 
 

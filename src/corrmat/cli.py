@@ -89,8 +89,8 @@ def train_weights() -> None:
         from corrmat.training import recipe, runs
 
         loaded = recipe.load(options.config, options.scale, options.overrides)
-        shipped = recipe.load(options.config, "laptop")
-        if (loaded.scale, loaded.data) == (shipped.scale, shipped.data):
+        shipped = recipe.load(_config_folder() / "weights.yaml", "laptop")
+        if (loaded.id, loaded.scale, loaded.data) == (shipped.id, "laptop", shipped.data):
             folder = options.runs / loaded.place / loaded.treatment
             results = _config_folder().parent / "results"
             ship(folder / "last.ckpt", runs.trained_facts(folder), results)
@@ -173,7 +173,7 @@ def _evaluate(options: Namespace) -> int:
 
     checkpoint = options.checkpoint or runs.best_checkpoint(loaded, arm, options.runs)
     if options.checkpoint is None and not checkpoint.is_file():
-        others = options.runs.glob(f"*/{loaded.data}/{loaded.id}/{arm.name}/best.ckpt")
+        others = options.runs.glob(f"*/{loaded.data}/{loaded.place.name}/{arm.name}/best.ckpt")
         scales = ", ".join(sorted(path.relative_to(options.runs).parts[0] for path in others))
         hint = f"there is one of --scale {scales}" if scales else "train first (corrmat fit)"
         raise CorrmatError(f"no checkpoint {checkpoint}; {hint}")

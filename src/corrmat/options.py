@@ -43,7 +43,7 @@ EPILOG = """examples:
 Every setting of a recipe is an option, too: --data.*, --network.*, --loss.*, --optimizer.*,
 --trainer.* (Lightning's own Trainer) and --seed. corrmat fit --help lists them with their types.
 
-exit codes: 0 done; 1 interrupted (the same command continues from its checkpoint);
+exit codes: 0 done; 1 interrupted (the same command, without --fresh, continues);
 2 the input cannot be used, and one line says why."""
 
 RUN_EPILOG = """examples:

@@ -35,7 +35,9 @@ def knn(points: Tensor, k: int) -> Tensor:
 
 @torch.no_grad()
 def neighbors_at_ranks(points: Tensor, ranks: Tensor) -> Tensor:
-    """Find each point's r-th nearest point of its cloud, for every rank r; rank 0 is itself.
+    """Find each point's r-th nearest point of its cloud, for every rank r. Rank 0 is itself.
+
+    Equally near points come in the order of the cloud.
 
     Args:
         points: (B, N, 3).

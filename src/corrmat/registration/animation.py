@@ -68,18 +68,22 @@ def _frames(
         moved = scene.source_at(share**2 * (3 - 2 * share))  # starts and stops slowly
         clouds[0].set_offsets(thin(fixed, MAX_POINTS) @ camera)
         clouds[1].set_offsets(thin(moved, MAX_POINTS) @ camera)
-        shown = BEFORE <= frame <= BEFORE + MATCHES
+        shown = len(i) > 0 and BEFORE <= frame <= BEFORE + MATCHES
         lines.set_segments(list(np.stack([moved[i], fixed[j]], 1) @ camera) if shown else [])
-        if frame < BEFORE:
-            title.set_text("source (orange) and target (blue)")
-        elif shown:
-            title.set_text(f"{len(i)} of the matches; green ones agree with the motion")
-        elif share < 1:
-            title.set_text(f"rotated by {registration.rotation_deg:.0f}°")
-        else:
-            title.set_text(f"{registration.verdict}, confidence {registration.confidence:.0%}")
+        title.set_text(_title(registration, share, len(i) if shown else 0))
         canvas.draw()
         yield Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+
+
+def _title(registration: Registration, share: float, lines: int) -> str:
+    """Say what a frame shows: `lines` matches, and the source after a share of its way."""
+    if lines:
+        return f"{lines} of the matches; green ones agree with the motion"
+    if share == 0:
+        return "source (orange) and target (blue)"
+    if share < 1:
+        return f"rotated by {registration.rotation_deg:.0f}°"
+    return f"{registration.verdict}, confidence {registration.confidence:.0%}"
 
 
 def _camera(azimuth_deg: float) -> np.ndarray:

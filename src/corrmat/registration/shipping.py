@@ -85,7 +85,8 @@ def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:
         pairs = held_out_pairs(protocol, CALIBRATION_PAIRS[points], seed=0, points=points)
         results = benchmark.compare(pairs, [model, "icp"])
         per_pair = results[model].per_pair
-        recalls.setdefault(protocol, results[model].recall_5deg)
+        if points == 512:
+            recalls[protocol] = results[model].recall_5deg
         scores += zip(per_pair["agreement"], per_pair["support"], strict=True)
         aligned += _aligned(per_pair)
         for result in results.values():

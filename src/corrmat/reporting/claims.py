@@ -28,7 +28,8 @@ from corrmat.reporting.record import Record
 from corrmat.reporting.tables import markdown_head, markdown_row, paper_metric, ratio_cell
 
 Verdict = Literal["confirmed", "confirmed in direction", "not shown", "contradicted"]
-LEFT_BASELINE = 0.5  # of identity's median error: an arm above it has learnt nothing to compare
+HIGH_RATE_CONTROL = "RPMNet_high_rate"
+LEFT_IDENTITY = 0.5  # of identity's median error: an arm above it has learnt nothing to compare
 NEAR_PAPER = 0.5  # of the paper's ratio: less is a confirmation of the direction only
 FLAT = 2.0  # growth of the error from the first to the last band of table 1
 STILL_LEARNING = 0.01  # gain of matches over the last quarter of a training that had not ended
@@ -76,7 +77,7 @@ class Evidence:
 
     def left_identity(self, errors: PairErrors) -> bool:
         """Tell whether an arm is clearly better than guessing the identity."""
-        return errors.median_deg < LEFT_BASELINE * self.identity_median_deg
+        return errors.median_deg < LEFT_IDENTITY * self.identity_median_deg
 
 
 def read_evidence(record: Record, results: Path) -> Evidence:
@@ -158,18 +159,18 @@ def sooner(evidence: Evidence) -> Claim | None:
     if not (baseline.curve and treatment.curve):
         return None
     # An error that is not a number is the worst there is.
-    goal = min(np.nan_to_num(point[name], nan=math.inf) for point in baseline.curve)
+    best = min(baseline.curve, key=lambda point: np.nan_to_num(point[name], nan=math.inf))
+    goal, taken = best[name], best["pairs_seen"]
     needed = next((p["pairs_seen"] for p in treatment.curve if p[name] <= goal), math.inf)
-    share = needed / baseline.pairs_seen
-    verdict: Verdict = "confirmed" if share <= 0.5 else "confirmed in direction"
+    verdict: Verdict = "confirmed" if needed <= taken / 2 else "confirmed in direction"
     at_once = needed == treatment.curve[0]["pairs_seen"]
-    if share >= 1:
-        verdict = "contradicted"
+    if needed >= taken:
+        verdict = "not shown" if needed == taken else "contradicted"
     if not evidence.left_identity(evidence.baseline):
         verdict = "not shown"
     reached = "never" if math.isinf(needed) else f"after {needed:,.0f}"
     reached += ", its first validation" if at_once else ""
-    goal_text = f"{goal:.3g} deg in validation, {record.baseline}'s best"
+    goal_text = f"{goal:.3g} deg in validation, {record.baseline}'s best, after {taken:,.0f}"
     control = _high_rate_control(record)
     best_at_high_rate = ""
     if control is not None and record.arms[control].curve:
@@ -283,7 +284,7 @@ def matches_say_more(evidence: Evidence) -> Claim | None:
 
 
 def _high_rate_control(record: Record) -> str | None:
-    return next((c for c in record.controls if c.endswith("high_rate")), None)
+    return HIGH_RATE_CONTROL if HIGH_RATE_CONTROL in record.controls else None
 
 
 def below_seventy_per_cent(evidence: Evidence) -> Claim | None:
@@ -364,7 +365,7 @@ def claims_of(records: Sequence[Record], results: Path) -> list[Claim]:
 
 def _judge(record: Record, results: Path) -> list[Claim]:
     """Judge the claims that a record bears on."""
-    if record.id not in JUDGED:
+    if record.id not in JUDGED or not set(record.compared) <= set(record.paper):
         return []
     evidence = read_evidence(record, results)
     claims = (judge(evidence) for judge in JUDGED[record.id])
@@ -382,8 +383,6 @@ def verdicts(record: Record, results: Path) -> str:
     """Judge a record that was just written, claim by claim; empty if it bears on none."""
     if record.scale == "smoke":
         return "smoke scale: everything runs, and nothing is learnt"
-    if not set(record.compared) <= set(record.paper):
-        return ""
     claims = _judge(record, results)
     return "\n".join(f"{claim.verdict}: {claim.words}\n    {claim.ours}" for claim in claims)
 

@@ -97,8 +97,8 @@ def rates_table(results: Path) -> str:
         for arm, result in sweep["arms"].items():
             cells = []
             for rate in result["rates"]:
-                cell = f"{rate['lr']:g}: {rate['rotation_error_deg_mean']:.3g} deg"
-                cells.append(f"**{cell}**" if rate["lr"] == result["chosen"] else cell)
+                text = f"{rate['lr']:g}: {rate['rotation_error_deg_mean']:.3g} deg"
+                cells.append(f"**{text}**" if rate["lr"] == result["chosen"] else text)
             pairs = f"{result['rates'][0]['pairs_seen']:,}"
             where = f"{sweep['id']}, {sweep['scale']}, {sweep['data']}"
             lines.append(markdown_row([where, arm, pairs, *cells]))
@@ -140,7 +140,7 @@ def low_rate_table(results: Path) -> str:
 
 def weights_table(records: Sequence[Record]) -> str:
     """Build the table of the trained arms that ship: names for `load_model`, and their records."""
-    lines = ["| name | record | training pairs | correct matches, % |", "|---|---|---|---|"]
+    lines = markdown_head(["name", "record", "training pairs", "correct matches, %"])
     by_place = {record.place.as_posix(): record for record in records}
     for model in shipped_models():
         about = shipped_metadata(model)
@@ -181,7 +181,7 @@ def bench_table(results: Path) -> str:
         return "No benchmark is recorded."
     bench = json.loads(path.read_text())
     heads = ["what", "ms", "peak memory, MB", "share of the matrix product's GFLOP/s"]
-    lines = [markdown_row([*heads, "time of the other way / ours"]), "|---" * 5 + "|"]
+    lines = markdown_head([*heads, "time of the other way / ours"])
     lines += [_bench_row(row) for row in bench["rows"] if "not_measured" not in row]
     lines += [""] + [
         f"- {what}, one pair of N points: time grows with N^{by['seconds']} (from N = 1024 on), "

@@ -161,7 +161,7 @@ class SaveOnInterrupt(Callback):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.stop_requested, self._stop_now = False, False
+        self.stop_requested = False
         self._just_validated = False
         self._previous: dict[signal.Signals, Any] = {}
 
@@ -211,7 +211,7 @@ class SaveOnInterrupt(Callback):
         if isinstance(exception, KeyboardInterrupt):
             if self.path.is_file():
                 log.info(f"interrupted at step {trainer.global_step}; checkpoint: {self.path}")
-                log.info("the same command continues from there")
+                log.info("the same command, without --fresh, continues from there")
             else:
                 log.info(f"interrupted at step {trainer.global_step}, before the first checkpoint")
 
@@ -221,8 +221,7 @@ class SaveOnInterrupt(Callback):
 
     def _request_stop(self, number: int, frame: object) -> None:
         """Handle a signal: the second one stops at once."""
-        self._stop_now = self.stop_requested
-        if self._stop_now:
+        if self.stop_requested:
             raise KeyboardInterrupt
         self.stop_requested = True
         # A signal that comes while a line is printed cannot print another: RuntimeError.

@@ -13,7 +13,7 @@ from corrmat.training.fit import silence_libraries
 from corrmat.training.preflight import prepare
 
 log = logging.getLogger("corrmat")
-RETRIES = 3  # of an arm whose worker is lost; it continues from its last checkpoint
+RETRIES = 3  # of an arm whose worker is lost; without `fresh` it continues from its checkpoint
 
 
 def train_all(

@@ -29,7 +29,7 @@ from corrmat.training.hardware import (
     resolve_precision,
     trainer_options,
 )
-from corrmat.training.preflight import Arm, build_method
+from corrmat.training.preflight import Arm, build_method, planned_steps
 from corrmat.training.recipe import ArmSettings
 from corrmat.training.runs import TrainedArm
 from corrmat.weights import load_model, load_state
@@ -137,11 +137,8 @@ def fresh_method(settings: ArmSettings) -> Method:
 def seconds_to_train(arm: Arm) -> float | None:
     """Estimate how long an arm trains, from a timed step; None on a GPU, or without a last step."""
     settings, trainer = arm.settings, arm.settings.trainer
-    steps = trainer.max_steps
-    if steps == -1:
-        batches = (trainer.max_epochs or -1) * len(arm.datamodule.train_dataloader())
-        steps = batches // trainer.accumulate_grad_batches
-    if steps < 0 or trainer.max_time is not None or on_gpu(trainer.accelerator):
+    steps = planned_steps(arm)
+    if steps is None or trainer.max_time is not None or on_gpu(trainer.accelerator):
         return None
     method = fresh_method(settings)
     dataset = arm.datamodule.test_dataloader().dataset

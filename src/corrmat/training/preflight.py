@@ -1,5 +1,6 @@
 """Preflight checks: what would fail late in a run fails before it starts."""
 
+import math
 from dataclasses import dataclass
 
 import lightning as L
@@ -42,7 +43,7 @@ def prepare(settings: ArmSettings) -> Arm:
             f"{required}; raise --data.num_points or lower --network.k"
         )
     datamodule.setup()
-    _check_optimization(settings)
+    _check_optimization(arm)
     _check_validation(arm)
     _try_one_batch(method, arm)
     try:
@@ -70,9 +71,21 @@ def build_method(settings: ArmSettings) -> Method:
         ) from error
 
 
-def _check_optimization(settings: ArmSettings) -> None:
+def planned_steps(arm: Arm) -> int | None:
+    """Count the optimizer's steps in an arm's training; None if it has no end that steps know."""
+    trainer = arm.settings.trainer
+    batches, limit = len(arm.datamodule.train_dataloader()), trainer.limit_train_batches
+    if limit is not None:
+        batches = min(batches, limit) if isinstance(limit, int) else int(batches * limit)
+    ends = [] if trainer.max_steps == -1 else [trainer.max_steps]
+    if trainer.max_epochs not in (None, -1):
+        ends.append(trainer.max_epochs * math.ceil(batches / trainer.accumulate_grad_batches))
+    return min(ends, default=None)
+
+
+def _check_optimization(arm: Arm) -> None:
     """Reject optimizer settings that Lightning would only fail on after training has started."""
-    trainer, optimizer = settings.trainer, settings.optimizer
+    trainer, optimizer = arm.settings.trainer, arm.settings.optimizer
     if trainer.accumulate_grad_batches < 1:
         raise CorrmatError(
             f"--trainer.accumulate_grad_batches {trainer.accumulate_grad_batches} is not positive"
@@ -86,10 +99,11 @@ def _check_optimization(settings: ArmSettings) -> None:
     if optimizer.schedule == "onecycle":
         if endless:
             raise CorrmatError("a one-cycle learning rate needs --trainer.max_steps or max_epochs")
-        if trainer.max_steps * optimizer.warmup == 1:  # torch divides by the steps after the first
+        steps = planned_steps(arm)
+        if steps is not None and steps * optimizer.warmup == 1:  # torch divides by those after it
             raise CorrmatError(
                 f"a one-cycle learning rate cannot rise in one step, {optimizer.warmup:g} of "
-                f"--trainer.max_steps {trainer.max_steps}: change either"
+                f"{steps} steps: change --optimizer.warmup or the number of steps"
             )
     if trainer.gradient_clip_val and str(trainer.precision) == "16-mixed":
         raise CorrmatError(

@@ -109,7 +109,9 @@ def _short(settings: ArmSettings, factor: float) -> ArmSettings:
     lr = float(f"{settings.optimizer.lr * factor:.2g}")
     trainer = deepcopy(settings.trainer)
     trainer.max_steps = max(2, round(trainer.max_steps * BUDGET))
-    trainer.val_check_interval = trainer.max_steps
+    # At the end: in batches, counted over epochs.
+    trainer.val_check_interval = trainer.max_steps * trainer.accumulate_grad_batches
+    trainer.check_val_every_n_epoch = None
     return replace(
         settings,
         name=f"{settings.name}-{lr:g}",

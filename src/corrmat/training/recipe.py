@@ -143,7 +143,7 @@ def load(
         arms=settings,
         bands_deg=tuple(cast(list[float], merged.get("bands_deg") or ())),
         sweep_outliers=tuple(cast(list[float], merged.get("sweep_outliers") or ())),
-        networks_of=str(merged["networks_of"]) if "networks_of" in merged else None,
+        networks_of=str(merged["networks_of"]) if merged.get("networks_of") else None,
         baselines=_check_baselines(cast(list[str], merged.get("baselines") or []), path),
         test_pairs=_expected_digest(merged, scale, settings, overrides or {}),
         **_roles(merged, all_arms, settings, path),  # pyright: ignore[reportArgumentType]
@@ -215,7 +215,7 @@ def _parameters(cls: type) -> dict[str, inspect.Parameter]:
 def _merge_layers(path: Path, scale: str, above: tuple[Path, ...] = ()) -> Settings:
     """Read a recipe and lay it over its base, and each one's scale over itself.
 
-    What the paper reports, and which test pairs an experiment has, is no base's to say.
+    An experiment's name, what the paper reports of it and which test pairs it has are its own.
     """
     recipe = _read(path)
     merged: Settings = {}
@@ -225,7 +225,7 @@ def _merge_layers(path: Path, scale: str, above: tuple[Path, ...] = ()) -> Setti
         if base.resolve() in above:
             raise CorrmatError(f"{path}: its base {base} is based on it")
         merged = _merge_layers(base, scale, above)
-        merged = {k: v for k, v in merged.items() if k not in ("paper", "test_pairs")}
+        merged = {k: v for k, v in merged.items() if k not in ("id", "paper", "test_pairs")}
     for layer in (recipe, _at_scale(recipe, scale)):
         merged = merge(merged, layer)
     return merged

@@ -1,9 +1,11 @@
 """The ledger under runs/: which arm is trained with which settings, and where to continue."""
 
+import itertools
 import json
 import logging
 import pickle
 import shutil
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -63,10 +65,22 @@ def set_aside(folder: Path, arm: Arm) -> None:
     if not (folder / _SETTINGS).is_file() or (_same_settings(folder, arm) and not recorded):
         shutil.rmtree(folder, ignore_errors=True)
         return
-    kept = folder.with_name(f"{folder.name}.previous")
+    kept = next(place for place in _places_to_keep(folder) if not _is_unfinished(place))
     shutil.rmtree(kept, ignore_errors=True)
     folder.rename(kept)
     log.info(f"the earlier run is kept: {kept}")
+
+
+def _places_to_keep(folder: Path) -> Iterator[Path]:
+    """List where a run may be set aside: arm.previous, arm.previous2, ..."""
+    yield folder.with_name(f"{folder.name}.previous")
+    for number in itertools.count(2):
+        yield folder.with_name(f"{folder.name}.previous{number}")
+
+
+def _is_unfinished(folder: Path) -> bool:
+    """Tell whether a folder has a run that was interrupted: it is not replaced by another."""
+    return folder.is_dir() and not (folder / _TRAINED).is_file()
 
 
 def start_run(folder: Path, arm: Arm) -> None:
