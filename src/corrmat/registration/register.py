@@ -230,7 +230,7 @@ def refine_chosen(
     """Refine the chosen transform (4, 4) on all of the model's points, by EM-ICP.
 
     If the shortlist was refined on as many points, that has been done. Else the last iterations
-    are enough. Generalised ICP follows where it is more exact: on points that the model has not
+    are enough, if the model has matches. Generalised ICP follows where it is more exact: on points that the model has not
     seen, and on points that both clouds share.
 
     Args:
@@ -240,7 +240,8 @@ def refine_chosen(
         full: scorer of the clouds, with all their points.
     """
     if max(map(len, subsamples)) > SHORTLIST_POINTS:
-        transform = em_icp(transform, *subsamples, hypotheses.prob, WIDTHS[-4:])
+        widths = WIDTHS if hypotheses.prob is None else WIDTHS[-4:]
+        transform = em_icp(transform, *subsamples, hypotheses.prob, widths)
     more = max(len(full.source), len(full.target)) > MODEL_POINTS
     return full.refine(transform) if more or full.shares_points(transform) else transform
 
