@@ -230,8 +230,8 @@ def refine_chosen(
     """Refine the chosen transform (4, 4) on all of the model's points, by EM-ICP.
 
     If the shortlist was refined on as many points, that has been done. Else the last iterations
-    are enough, if the model has matches. Generalised ICP follows where it is more exact: on points that the model has not
-    seen, and on points that both clouds share.
+    are enough, if the model has matches. Generalised ICP follows where it is more exact: on points
+    that the model has not seen, and on points that both clouds share.
 
     Args:
         transform: of the source onto the target.
