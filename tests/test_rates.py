@@ -28,10 +28,11 @@ def test_every_arm_is_trained_at_the_same_three_factors_and_the_best_is_chosen(t
 
 
 def test_a_sweep_validates_at_its_end_whatever_a_step_is(tmp_path):
-    overrides = {"trainer": {"accumulate_grad_batches": 2, "max_steps": 60}}
+    trainer = {"accumulate_grad_batches": 2, "max_steps": 60}
+    overrides = {"trainer": trainer, "data": {"batch_size": 6}}
     loaded = recipe.load(ROOT / "configs" / "exp" / "1.2.yaml", "smoke", overrides)
     swept = rates.sweep(loaded, tmp_path / "results", tmp_path / "runs")
-    assert {rate.pairs_seen for results in swept.values() for rate in results} == {3 * 2 * 4}
+    assert {rate.pairs_seen for results in swept.values() for rate in results} == {3 * 2 * 6}
 
 
 def test_an_arm_at_a_steady_rate_keeps_the_papers(tmp_path):

@@ -126,7 +126,10 @@ def choice_table(results: Path) -> str:
         right = [f"{record[name]['right_matches'][anchors]:.1%}" for name in protocols]
         lines.append(markdown_row([f"right matches, {anchors} anchors", *right]))
     counts = ", ".join(f"{record[name]['pairs']} {name}" for name in protocols)
-    means = ", ".join(f"{record[name]['candidates']:.0f} ({name})" for name in protocols)
+    means = ", ".join(
+        f"{by['candidates']:.0f}, {by['distinct']:.1f} of them different ({name})"
+        for name, by in ((name, record[name]) for name in protocols)
+    )
     return "\n".join([*lines, "", f"{counts} pairs. Candidates a pair, in the mean: {means}."])
 
 
