@@ -121,11 +121,12 @@ def test_the_table_of_the_choice_has_a_row_for_all_weights(tmp_path):
     tried = {"0.0, 0.0": {"recall_5deg": 0.5, "recall_adds": 0.25}}
     path = tmp_path / "register" / "choice.json"
     path.parent.mkdir()
-    real = {"pairs": 8, "candidates": 11.4, "weights": tried, "right_matches": {"64": 0.475}}
+    counts = {"pairs": 8, "candidates": 11.4, "distinct": 2.0}
+    real = {**counts, "weights": tried, "right_matches": {"64": 0.475}}
     path.write_text(json.dumps({"real": real}))
     assert "| 0.0, 0.0 | 50.0%, 25.0% |" in comparisons.choice_table(tmp_path)
     assert "| right matches, 64 anchors | 47.5% |" in comparisons.choice_table(tmp_path)
-    assert "Candidates a pair, in the mean: 11 (real)" in comparisons.choice_table(tmp_path)
+    assert "in the mean: 11, 2.0 of them different (real)" in comparisons.choice_table(tmp_path)
 
 
 def test_fragments_of_a_room_overlap_in_part_and_lie_on_each_other():

@@ -576,9 +576,9 @@ def test_a_cycle_that_would_rise_in_one_step_is_refused_before_anything_is_delet
     arm = prepare(load("1.1", "--trainer.max_epochs", "3").arms["DCP"])
     batches = len(arm.datamodule.train_dataloader())
     assert planned_steps(arm) == 3 * batches
-    options = "--trainer.max_epochs", "1", "--trainer.limit_train_batches", "10"
+    options = "--trainer.max_epochs", "1", "--trainer.limit_train_batches", "5"
     with pytest.raises(CorrmatError, match="cannot rise in one step"):
-        prepare(load("1.1", *options, "--optimizer.warmup", "0.1").arms["DCP"])
+        prepare(load("1.1", *options, "--optimizer.warmup", "0.2").arms["DCP"])
 
 
 def test_checkpoints_reload_to_the_same_network(tmp_path):

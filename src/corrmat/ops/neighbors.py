@@ -51,7 +51,7 @@ def neighbors_at_ranks(points: Tensor, ranks: Tensor) -> Tensor:
         offset = axis.unsqueeze(-1) - axis.unsqueeze(-2)
         squared.addcmul_(offset, offset)
     if squared.device.type == "cpu":
-        order = torch.from_numpy(_nearest_first(squared.numpy(), int(ranks.max()) + 1))
+        order = torch.from_numpy(_nearest_first(squared.numpy(), int(ranks.numpy().max()) + 1))
     else:
         order = squared.argsort(dim=-1, stable=True)
     return order[..., ranks.to(order.device)]
