@@ -27,7 +27,7 @@ from corrmat.registration.register import (
     CANDIDATE_STEPS,
     CHOICE_WEIGHTS,
     SHORTLIST,
-    WITHOUT_MATCHES,
+    STEPS_WITHOUT_MATCHES,
     distinct,
     measure,
     prepare_clouds,
@@ -54,14 +54,11 @@ PRIORS = "without matches", "with matches"  # of EM-ICP
 _SEED = 5  # of pairs that nothing else uses
 
 
-class PairTables(NamedTuple):
-    """What the candidates of a pair are worth; the last of them is the true transform."""
+class CandidateTables(NamedTuple):
+    """What candidates are worth; the last of them is the true transform."""
 
     measures: np.ndarray  # (2, T + 1, 3) agreement, coherence, unmatched loss; after EM-ICP, too
     errors: np.ndarray  # (2, T + 1, 2) degrees and ADD-S, after generalised ICP and after EM-ICP
-    candidates: int  # before copies are dropped
-    refined_truth: np.ndarray  # (2, 2) the same of the truth after EM-ICP alone, as `PRIORS`
-    right_matches: list[float]  # share of the matches, by weight, for each of `ANCHORS`
 
     def choose(self, weights: tuple[float, float], shortlist: int, truth: bool = False) -> int:
         """Choose the best of the shortlist after EM-ICP.
@@ -76,38 +73,44 @@ class PairTables(NamedTuple):
         return int(best[ranking(after[best], weights)[0]])
 
 
-def tables_of(
-    pairs: PairBatch, index: int, generate: NetworkHypotheses, steps: int = CANDIDATE_STEPS
-) -> PairTables:
-    """Refine and measure the candidates of a pair, and the true transform in the same way.
+class PairTables(NamedTuple):
+    """What a pair's candidates, and its truth, are worth."""
 
-    Args:
-        pairs: of a protocol.
-        index: of the pair.
-        generate: the model.
-        steps: of generalised ICP for each candidate.
-    """
+    candidates: int  # before copies are dropped
+    in_use: CandidateTables  # after as many steps of generalised ICP as `register` makes
+    more_steps: CandidateTables
+    refined_truth: np.ndarray  # (2, 2) errors of the truth after EM-ICP alone, as `PRIORS`
+    right_matches: list[float]  # share of the matches, by weight, for each of `ANCHORS`
+
+
+def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> PairTables:
+    """Refine and measure the candidates of a pair, and the true transform in the same way."""
     source, target = (c[index].double().numpy() for c in (pairs.source, pairs.target))
     (x, y), scale, subsamples, scorer = prepare_clouds(source, target, 0)
     hypotheses = generate(*subsamples, 0)
     rotation, translation = pairs.rotation[index].double().numpy(), pairs.translation[index].numpy()
     truth = rigid.to_homogeneous(rotation, scale * (rotation @ x.centre + translation - y.centre))
-    start = [scorer.refine(each, steps) for each in (*hypotheses.transforms, truth)]
-    candidates = np.stack([*distinct(np.stack(start[:-1])), start[-1]])
-    gicp = np.stack([scorer.refine(each) for each in candidates])
-    em = refine_shortlist(candidates, hypotheses, subsamples)
-    final = [refine_chosen(each, hypotheses, subsamples, scorer) for each in em]
-    truths = [em_icp(truth, *subsamples, prior) for prior in (None, hypotheses.prob)]
 
     def errors_of(transforms: Iterable[np.ndarray]) -> np.ndarray:
         in_units = [to_original_units(t, scale, x.centre, y.centre) for t in transforms]
         return np.array([benchmark.errors(pairs, index, t) for t in in_units])
 
+    def refined(steps: int) -> CandidateTables:
+        start = [scorer.refine(each, steps) for each in (*hypotheses.transforms, truth)]
+        candidates = np.stack([*distinct(np.stack(start[:-1])), start[-1]])
+        gicp = [scorer.refine(each) for each in candidates]
+        em = refine_shortlist(candidates, hypotheses, subsamples)
+        final = [refine_chosen(each, hypotheses, subsamples, scorer) for each in em]
+        return CandidateTables(
+            np.stack([measure(each, hypotheses, scorer) for each in (candidates, em)]),
+            np.stack([errors_of(each) for each in (gicp, final)]),
+        )
+
     return PairTables(
-        np.stack([measure(each, hypotheses, scorer) for each in (candidates, em)]),
-        np.stack([errors_of(each) for each in (gicp, final)]),
         len(hypotheses.transforms),
-        errors_of(truths),
+        refined(CANDIDATE_STEPS),
+        refined(STEPS_WITHOUT_MATCHES),
+        errors_of(em_icp(truth, *subsamples, prior) for prior in (None, hypotheses.prob)),
         [matches_of(generate, count, subsamples).support(truth, *subsamples) for count in ANCHORS],
     )
 
@@ -125,19 +128,20 @@ def matches_of(
         network.test_anchors = usual
 
 
-def outcomes(table: PairTables, more_steps: PairTables) -> dict[str, np.ndarray]:
+def outcomes(table: PairTables) -> dict[str, np.ndarray]:
     """Return the errors (2,) of one pair for all weights and refinements."""
-    gicp, em = table.errors
-    rows = {f"{a}, {b}": em[table.choose((a, b), 1)] for a, b in TRIED}
+    in_use, more_steps = table.in_use, table.more_steps
+    gicp, em = in_use.errors
+    rows = {f"{a}, {b}": em[in_use.choose((a, b), 1)] for a, b in TRIED}
     for shortlist in (SHORTLIST, 2 * SHORTLIST):
         name = f"in use, {shortlist} candidates refined by EM-ICP before the choice"
-        rows[name] = em[table.choose(CHOICE_WEIGHTS, shortlist)]
-    name = f"in use, {WITHOUT_MATCHES} steps of generalised ICP for each candidate"
+        rows[name] = em[in_use.choose(CHOICE_WEIGHTS, shortlist)]
+    name = f"in use, {STEPS_WITHOUT_MATCHES} steps of generalised ICP for each candidate"
     rows[name] = more_steps.errors[1][more_steps.choose(CHOICE_WEIGHTS, SHORTLIST)]
     rows["best candidate"] = em[:-1].min(0)
-    with_truth = table.choose(CHOICE_WEIGHTS, SHORTLIST, truth=True)
+    with_truth = in_use.choose(CHOICE_WEIGHTS, SHORTLIST, truth=True)
     rows["in use, the truth among the candidates"] = em[with_truth]
-    rows["in use, generalised ICP alone"] = gicp[table.choose(CHOICE_WEIGHTS, 1)]
+    rows["in use, generalised ICP alone"] = gicp[in_use.choose(CHOICE_WEIGHTS, 1)]
     rows["the truth, after generalised ICP"] = gicp[-1]
     for prior, errors in zip(PRIORS, table.refined_truth, strict=True):
         rows[f"the truth, after EM-ICP {prior}"] = errors
@@ -159,19 +163,16 @@ def main() -> None:
     content: dict[str, object] = {"commit": commit(), "points": 512}
     for protocol, count in PAIRS.items():
         pairs = held_out_pairs(protocol, count, _SEED)
-        both = [
-            [
-                tables_of(pairs, index, generate, steps)
-                for steps in (CANDIDATE_STEPS, WITHOUT_MATCHES)
-            ]
+        tables = [
+            tables_of(pairs, index, generate)
             for index in track(range(len(pairs)), protocol, transient=True)
         ]
-        rows, tables = [outcomes(*pair) for pair in both], [pair[0] for pair in both]
+        rows = [outcomes(table) for table in tables]
         means = np.mean([table.right_matches for table in tables], 0).round(4).tolist()
         content[protocol] = {
             "pairs": len(tables),
             "candidates": float(np.mean([table.candidates for table in tables])),
-            "distinct": float(np.mean([len(table.errors[0]) - 1 for table in tables])),
+            "distinct": float(np.mean([len(table.in_use.errors[0]) - 1 for table in tables])),
             "weights": {name: shares([row[name] for row in rows]) for name in rows[0]},
             "right_matches": dict(zip(map(str, ANCHORS), means, strict=True)),
         }

@@ -7,6 +7,7 @@ with the candidates, choice and refinement of today; `validation` in results/reg
 is written anew.
 """
 
+import itertools
 import json
 import subprocess
 import tempfile
@@ -36,10 +37,10 @@ def extract_weights(folder: Path) -> dict[int, Path]:
     """Write the newest weights of each number of training pairs into a folder."""
     found: dict[int, Path] = {}
     commits = git("log", "--format=%H", "--", WEIGHTS).decode().split()
-    for number, commit in enumerate(["", *commits]):
+    committed = (git("show", f"{commit}:{WEIGHTS}") for commit in commits)
+    for number, content in enumerate(itertools.chain([(ROOT / WEIGHTS).read_bytes()], committed)):
         path = folder / f"{number}.safetensors"
-        current = (ROOT / WEIGHTS).read_bytes
-        path.write_bytes(git("show", f"{commit}:{WEIGHTS}") if commit else current())
+        path.write_bytes(content)
         with safetensors.safe_open(path, framework="pt") as file:
             pairs = (file.metadata() or {}).get("pairs")
         if pairs is None:

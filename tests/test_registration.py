@@ -103,11 +103,10 @@ def test_any_unit_and_place_gives_the_same_motion(pair):
         assert result.rmse == pytest.approx(factor * near.rmse, rel=0.2)
 
 
-def test_detail_far_from_the_origin_is_not_lost():
+def test_detail_far_from_the_origin_is_not_lost(generator):
     """Millimetres at coordinates of 1e7: the moved source meets the target to float64."""
-    rng = np.random.default_rng(0)
     points = make_shape(("test", 3))[0][:, :3].astype(np.float64)
-    rotation = drawn_rotation(rng)
+    rotation = random_rotation(1, generator)[0].numpy()
     source = 1000 * points + 1e7
     target = (1000 * points) @ rotation.T - 1e7
     result = corrmat.register(source, target)
@@ -190,12 +189,6 @@ def test_a_stray_point_does_not_shrink_the_picture(pair):
     assert np.isnan(scene.aligned).any(1).tolist() == [False] * len(source) + [True]
     low, high = extent(scene.source_at(0.5))
     assert (high - low).max() < 3 * np.ptp(target, axis=0).max()
-
-
-def drawn_rotation(rng):
-    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
-    q = q * np.sign(np.diag(r))
-    return q * np.linalg.det(q)
 
 
 GRID = np.stack(np.meshgrid(*[np.arange(4.0)] * 3), -1).reshape(-1, 3)

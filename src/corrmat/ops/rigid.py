@@ -47,7 +47,10 @@ def invert(rotation: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
 
 def to_homogeneous(rotation: ArrayLike | Tensor, translation: ArrayLike | Tensor) -> np.ndarray:
     """Build the (..., 4, 4) float64 matrices of transforms ((..., 3, 3), (..., 3)) on a CPU."""
-    rotation, translation = np.asarray(rotation), np.asarray(translation)
+    rotation, translation = (  # NumPy knows no bfloat16
+        part.double().numpy() if isinstance(part, Tensor) else np.asarray(part)
+        for part in (rotation, translation)
+    )
     matrix = np.zeros((*translation.shape[:-1], 4, 4))
     matrix[..., :3, :3], matrix[..., :3, 3], matrix[..., 3, 3] = rotation, translation, 1
     return matrix

@@ -163,8 +163,7 @@ class NetworkHypotheses:
         finally:
             for module, mode in modes:
                 module.training = mode
-        own_transform = prediction.rotation.cpu().double(), prediction.translation.cpu().double()
-        transform = rigid.to_homogeneous(*own_transform)
+        transform = rigid.to_homogeneous(prediction.rotation.cpu(), prediction.translation.cpu())
         if not np.isfinite(transform).all():
             raise CorrmatError("the network's transform is not finite: has its training diverged?")
         return transform, prediction.correspondence

@@ -32,7 +32,7 @@ FULL_POINTS = 20_000  # to refine the selected one
 CHOICE_WEIGHTS = 4.0, -1.0
 WITHOUT_MATCHABILITIES = 1.5, 0.0  # for models that have none: no unmatched loss
 CANDIDATE_STEPS = 5  # of generalised ICP, for each candidate; EM-ICP with matches does the rest
-WITHOUT_MATCHES = 30  # the same for models that have none
+STEPS_WITHOUT_MATCHES = 30  # the same for models that have none
 SAME_TRANSFORM = 0.1  # difference of two matrices: a turn by 4 degrees, or a shift by 0.1
 SHORTLIST = 2  # best candidates, which EM-ICP refines before one is chosen
 SHORTLIST_POINTS = 400  # of either cloud, for that refinement
@@ -121,7 +121,7 @@ def register(
 
     candidates = hypotheses.transforms
     if refine == "icp":
-        steps = WITHOUT_MATCHES if hypotheses.prob is None else CANDIDATE_STEPS
+        steps = STEPS_WITHOUT_MATCHES if hypotheses.prob is None else CANDIDATE_STEPS
         candidates = distinct(np.stack([scorer.refine(t, steps) for t in candidates]))
     candidates = ranked(candidates)
     if refine == "icp":
