@@ -151,6 +151,21 @@ def test_growth_over_bands():
         assert judged.verdict == verdict
 
 
+@pytest.mark.parametrize(
+    ("scales", "verdict"),
+    [
+        ((3.0, 0.3), "confirmed"),
+        ((3.0, 30.0), "contradicted"),
+        ((70.0, 0.3), "not shown"),  # METHOD learnt nothing
+    ],
+)
+def test_lower_in_every_band(scales, verdict):
+    one = errors([*drawn(1.0).rotation_deg, *drawn(1.2).rotation_deg], band=[0] * 300 + [1] * 300)
+    arms = [dataclasses.replace(one, rotation_deg=scale * one.rotation_deg) for scale in scales]
+    judged = claims.lower_in_every_band(evidence(*arms, bands_deg=(0, 30, 60)))
+    assert judged.verdict == verdict
+
+
 def test_the_last_quarter_of_a_training_is_a_quarter_of_its_pairs():
     """3.1 on shapes: 4,800 pairs, six validations; between the last two lies a sixth."""
     matches = (0.195, 0.27, 0.294, 0.354, 0.395, 0.402)

@@ -28,16 +28,14 @@ def angle_deg(a, b):
 
 def test_the_best_motion_is_the_truth_among_seven_tenths_wrong(generator):
     rotation, translation, x, y = matches(generator)
-    estimate, shift, score = ransac(x, y, torch.ones(len(x)), 0.05, generator=generator)
+    estimate, shift = ransac(x, y, torch.ones(len(x)), 0.05, generator=generator)
     assert angle_deg(estimate[0], rotation) < 1
     assert (shift[0] - translation).norm() < 0.02
-    assert (score[:-1] >= score[1:]).all()
-    assert score[0] > 3 * score[1]
 
 
 def test_motions_that_are_returned_differ(generator):
     _, _, x, y = matches(generator, wrong=0.9)
-    rotation, _, _ = ransac(x, y, torch.ones(len(x)), 0.1, generator=generator, count=5)
+    rotation, _ = ransac(x, y, torch.ones(len(x)), 0.1, generator=generator, count=5)
     assert 1 < len(rotation) <= 5
     for i in range(len(rotation)):
         for j in range(i):
@@ -52,7 +50,7 @@ def test_weights_decide_between_two_motions(generator):
     y[100:] = x[100:] @ other.T
     weight = torch.ones(200)
     weight[100:] = 0.3
-    rotation, _, _ = ransac(x, y, weight, 0.05, generator=generator)
+    rotation, _ = ransac(x, y, weight, 0.05, generator=generator)
     assert angle_deg(rotation[0], one) < 1
     assert angle_deg(rotation[1], other) < 1
 
@@ -69,16 +67,14 @@ def test_the_same_generator_gives_the_same_motions(generator):
 def test_matches_that_no_rigid_motion_explains_give_none(generator):
     x = torch.rand(30, 3, generator=generator)
     for y, weight in ((10 * x, torch.ones(30)), (x, torch.zeros(30))):
-        rotation, shift, score = ransac(x, y, weight, 0.01, generator=generator)
+        rotation, shift = ransac(x, y, weight, 0.01, generator=generator)
         assert rotation.shape == (0, 3, 3)
         assert shift.shape == (0, 3)
-        assert score.shape == (0,)
 
 
 def test_points_on_a_line_are_laid_on_each_other(generator):
     """How they turn about their line nobody can say; that they meet, everybody."""
     x = torch.rand(30, 1, generator=generator) * torch.tensor([1.0, 2.0, 3.0])
-    rotation, shift, score = ransac(x, x, torch.ones(30), 0.01, generator=generator)
+    rotation, shift = ransac(x, x, torch.ones(30), 0.01, generator=generator)
     moved = x.double() @ rotation[0].T + shift[0]
     torch.testing.assert_close(moved, x.double())
-    assert score[0] > 29

@@ -63,7 +63,7 @@ def best_by_matches(
     weight: Tensor,
     inlier_threshold: float,
     count: int,
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor]:
     """Select the distinct transforms that most of the matches agree on, and refit them.
 
     A transform scores the weight of the matches that it explains, each less the larger its
@@ -79,10 +79,8 @@ def best_by_matches(
         count: transforms returned at most.
 
     Returns:
-        Rotations (T, 3, 3), translations (T, 3) and scores (T,), best first.
+        Rotations (T, 3, 3) and translations (T, 3), best first.
     """
-    if not len(rotation):
-        return rotation, translation, translation.new_empty(0)
     x, y, weight = x.double(), y.double(), weight.double()
     score, _ = _score(rotation, translation, x, y, weight, inlier_threshold)
     best = best_distinct(rotation, score, count)
@@ -93,7 +91,7 @@ def best_by_matches(
         rotation, translation = rigid.procrustes(*matches, explained)
     score, _ = _score(rotation, translation, x, y, weight, inlier_threshold)
     best = best_distinct(rotation, score, count)
-    return rotation[best], translation[best], score[best]
+    return rotation[best], translation[best]
 
 
 def _side_lengths(triangle: Tensor) -> Tensor:

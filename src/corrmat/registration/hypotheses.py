@@ -129,7 +129,7 @@ class NetworkHypotheses:
         i, j = place // prob.shape[1], place % prob.shape[1]
         weighted = x[0, i, :3], y[0, j, :3], weight.sqrt(), _INLIER_THRESHOLD
         fits = fit_triples(*weighted, generator=torch.Generator().manual_seed(seed))
-        by_matches = best_by_matches(*fits, *weighted, _BY_MATCHES)[:2]
+        by_matches = best_by_matches(*fits, *weighted, _BY_MATCHES)
         rotation, translation = (t[:_RANKED] for t in fits)
         score = rough_agreement(rotation, translation, x[0], y[0])
         best = best_distinct(rotation, score, _BY_AGREEMENT)

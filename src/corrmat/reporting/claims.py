@@ -218,6 +218,8 @@ def lower_in_every_band(evidence: Evidence) -> Claim:
     verdict: Verdict = "confirmed" if better == len(ratios) else "not shown"
     if worse:
         verdict = "contradicted"
+    if not evidence.left_identity(evidence.baseline):
+        verdict = "not shown"
     return Claim(
         "2.4: RPMNet_corr's error is lower in every band (table 2)",
         "6 of 6 bands",
