@@ -102,7 +102,6 @@ def test_the_command_moves_every_scan_onto_the_last(tmp_path, monkeypatch, capsy
         points = cloud[part::3] @ pose[:3, :3].T + pose[:3, 3]
         write_ply(tmp_path / f"{name}.ply", points)
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "moved").mkdir()
     assert main(["register", "a.ply", "b.ply", "c.ply", "-o", "moved", "--json", "out.json"]) == 0
     printed = capsys.readouterr().out
     assert "a.ply" in printed
@@ -122,6 +121,7 @@ def test_the_command_moves_every_scan_onto_the_last(tmp_path, monkeypatch, capsy
     [
         (["a.ply", "b.ply", "c.ply", "--html", "x.html"], "two scans"),
         (["a.ply", "b.ply", "c.ply", "-o", "out.ply"], "folder"),
+        (["a.ply", "b.ply", "c.ply", "-o", "a.ply/moved"], "cannot write"),
         (["a.ply"], "target"),
     ],
 )

@@ -18,6 +18,8 @@ from corrmat.ops import rigid
 from corrmat.ops.correspondence import SoftCorrespondence
 from corrmat.types import Prediction
 
+_NEEDS_EXTRA = "needs the extra baselines: pip install -e '.[baselines]' in corrmat's folder"
+
 
 class Identity(nn.Module):
     """Identity baseline: the error that a method must beat."""
@@ -174,7 +176,7 @@ def kiss_matcher(
     try:
         package: Any = importlib.import_module("kiss_matcher")
     except ImportError as error:
-        raise CorrmatError(f"kiss is KISS-Matcher: pip install kiss-matcher ({error})") from error
+        raise CorrmatError(f"KISS-Matcher {_NEEDS_EXTRA} ({error})") from error
     config = package.KISSMatcherConfig(
         voxel_size=settings.voxel_size, use_voxel_sampling=voxel_sampling
     )
@@ -189,9 +191,7 @@ def _open3d() -> Any:  # noqa: ANN401
         importlib.import_module("threadpoolctl")
         return importlib.import_module("open3d")
     except ImportError as error:
-        raise CorrmatError(
-            f"ransac and fgr are Open3D's: pip install open3d threadpoolctl ({error})"
-        ) from error
+        raise CorrmatError(f"Open3D, for ransac and fgr, {_NEEDS_EXTRA} ({error})") from error
 
 
 def _fpfh(

@@ -300,18 +300,18 @@ def _register_several(options: Namespace) -> int:
     """Register several files onto one."""
     if options.html or options.gif:
         raise CorrmatError("--html and --gif show two scans; --output moves several, to look at")
+    from corrmat.files import ensure_writable, replace_text
+
     names = [path.with_suffix(".ply").name for path in options.source]
     if options.output is not None:
-        if not options.output.is_dir():
-            raise CorrmatError(
-                f"{options.output}: with several scans, --output is a folder that exists"
-            )
+        if options.output.suffix.lower() == ".ply" or options.output.is_file():
+            raise CorrmatError(f"{options.output}: with several scans, --output is a folder")
         if len(set(names)) < len(names):
             raise CorrmatError(f"two scans would both be written to {options.output}: rename one")
         for name in names:
             _keep_scans(options, options.output / name)
+        ensure_writable(options.output)
     from corrmat.data.scans import read_scan, write_ply
-    from corrmat.files import replace_text
 
     scans = [read_scan(path, options.seed) for path in (*options.source, options.target)]
     from corrmat.registration import pose_graph
@@ -321,6 +321,7 @@ def _register_several(options: Namespace) -> int:
     )
     print(pose_graph.to_text(options.source, options.target, poses))
     if options.output is not None:
+        options.output.mkdir(parents=True, exist_ok=True)
         for name, scan, pose in zip(names, scans, poses, strict=False):
             moved = scan @ pose.transform[:3, :3].T + pose.transform[:3, 3]
             write_ply(options.output / name, moved)

@@ -66,11 +66,16 @@ COMPARE_EPILOG = """examples:
   corrmat compare corrmat,ransac,fgr,icp --protocol real
   corrmat compare corrmat,dcp_v1.t7 --data modelnet40 --root /data --points 1024
 
-protocols: real: disjoint samples, noise, both clouds cropped and with outliers, normals
-estimated; views: what two depth cameras see, up to 60 degrees apart; clean: real without crop
-and outliers; rooms: fragments of procedural rooms (--points 20000); paper: experiment 1.2's
-pairs. kiss is KISS-Matcher, ransac17 RANSAC with
-seventeen candidates; corrmat has up to twenty-five."""
+protocols:
+  real    two scans of one shape: no shared point, noise, outliers, normals estimated, and
+          either cloud without 30 % of its points
+  views   what two depth cameras see of one shape, up to 60 degrees apart
+  clean   real without crop and outliers
+  rooms   fragments of procedural rooms, in metres (--points 20000)
+  paper   the pairs of experiment 1.2
+
+classical pipelines: icp; ransac and fgr, over FPFH features; ransac17, RANSAC with seventeen
+candidates, where corrmat has up to twenty-five; kiss, KISS-Matcher."""
 
 REGISTER_EPILOG = """examples:
   corrmat register scan1.ply scan2.ply
@@ -80,7 +85,7 @@ REGISTER_EPILOG = """examples:
   corrmat register front.ply left.ply back.ply -o moved/
       every scan onto the last: all pairs are registered, and the poses that most agree on win
   corrmat register a.npy b.npy --model ransac
-      the classical pipeline instead (pip install open3d threadpoolctl)
+      the classical pipeline instead (pip install -e '.[baselines]' in corrmat's folder)
 
 Files: PLY, OBJ, STL, OFF, GLB, GLTF (meshes are sampled, scenes merged), PCD, XYZ, TXT, CSV,
 NPY, NPZ. Both files must have the same unit, whichever it is. Parts may be missing from either.
@@ -298,8 +303,8 @@ def _add_register_options(parser: ArgumentParser) -> None:
     parser.add_argument("target", type=Path, help="the cloud or mesh that they are moved onto")
     parser.add_argument(
         "-o", "--output", type=Path, metavar="PLY",
-        help="write the moved source (the points sampled on it, if it is a mesh); a folder, if "
-        "there are several",
+        help="write the moved source (the points sampled on it, if it is a mesh); the folder to "
+        "write them into, if there are several",
     )  # fmt: skip
     parser.add_argument("--json", type=Path, help="write matrix, confidence and verdict")
     parser.add_argument("--html", type=Path, help="write a page: before, matches, after")

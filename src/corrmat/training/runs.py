@@ -1,4 +1,4 @@
-"""The ledger under runs/: which arm is trained with which settings, and where to continue."""
+"""What lies under runs/: which arm is trained with which settings, and where to continue."""
 
 import itertools
 import json
