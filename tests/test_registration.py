@@ -16,6 +16,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 import corrmat
+from corrmat.baselines import fpfh_ransac
 from corrmat.calibration import verdict
 from corrmat.cli import main
 from corrmat.data.normals import estimate_normals
@@ -450,6 +451,13 @@ def test_classical_pipelines_give_a_motion(pair, model):
     assert np.linalg.det(result.transform[:3, :3]) == pytest.approx(1, abs=1e-6)
     seeded = [corrmat.register(source, target, model=model, seed=2**40).transform for _ in range(2)]
     np.testing.assert_allclose(*seeded, atol=1e-6)
+
+
+def test_open3d_prints_no_warning_of_few_matches(capfd):
+    pytest.importorskip("open3d")
+    clouds = np.random.default_rng(1).standard_normal((2, 40, 3)) / 2
+    fpfh_ransac(*(np.hstack([cloud, estimate_normals(cloud)]) for cloud in clouds), [0])
+    assert capfd.readouterr().out == ""
 
 
 def test_without_open3d_the_classical_pipelines_say_what_to_install(pair, monkeypatch):

@@ -146,10 +146,14 @@ def fpfh_fgr(
 
 @contextlib.contextmanager
 def _repeatable(o3d: Any, seed: int) -> Iterator[None]:  # noqa: ANN401
-    """Seed Open3D and keep it to one thread: on several, RANSAC is not the same twice."""
+    """Seed Open3D and keep it to one thread: on several, RANSAC is not the same twice.
+
+    Its warnings, of few matches for example, would stand between the lines of a result.
+    """
     o3d.utility.random.seed(seed % 2**31)
     threadpoolctl: Any = importlib.import_module("threadpoolctl")
-    with threadpoolctl.threadpool_limits(1):
+    quiet = o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error)
+    with quiet, threadpoolctl.threadpool_limits(1):
         yield
 
 
