@@ -2,11 +2,12 @@
 
     python benchmarks/choice.py        minutes
 
-A candidate's score is agreement + a * coherence + b * unmatched loss (`registration/register.py`).
-This tests weights and refinements on pairs of training shapes that were held out of the training
-of the network, and writes results/register/choice.json. The weights in use were chosen on other
-such pairs. `right_matches` is how many of the network's matches, by weight, the true transform
-explains, for several numbers of anchors that its points attend to.
+A candidate's score is agreement + a * coherence + b * unmatched loss + c * support
+(`registration/register.py`). This tests weights and refinements on pairs of training shapes that
+no training of the network but the first saw, and writes results/register/choice.json. The weights
+in use were chosen on other pairs of these shapes. `right_matches` is how many of the network's
+matches, by weight, the true transform explains, for several numbers of anchors that its points
+attend to.
 """
 
 import json
@@ -17,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from rich.progress import track
 
+from corrmat.files import replace_text
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG
 from corrmat.networks.invariant import InvariantNetwork
 from corrmat.ops import rigid
@@ -26,14 +28,12 @@ from corrmat.registration.hypotheses import Hypotheses, NetworkHypotheses
 from corrmat.registration.register import (
     CANDIDATE_STEPS,
     CHOICE_WEIGHTS,
-    SHORTLIST,
     STEPS_WITHOUT_MATCHES,
+    choose,
     distinct,
     measure,
     prepare_clouds,
-    ranking,
     refine_chosen,
-    refine_shortlist,
     to_original_units,
 )
 from corrmat.registration.shipping import held_out_pairs
@@ -42,11 +42,13 @@ from corrmat.types import PairBatch
 from corrmat.weights import load_model
 
 PATH = Path(__file__).resolve().parents[1] / "results" / "register" / "choice.json"
-_COHERENCE, _UNMATCHED = CHOICE_WEIGHTS
+_COHERENCE, _UNMATCHED, _SUPPORT = CHOICE_WEIGHTS
 TRIED = (
-    (0.0, 0.0), (1.5, 0.0), (_COHERENCE, 0.0), (0.0, _UNMATCHED), CHOICE_WEIGHTS,
-    (_COHERENCE / 2, _UNMATCHED), (2 * _COHERENCE, _UNMATCHED),
-    (_COHERENCE, _UNMATCHED / 2), (_COHERENCE, 2 * _UNMATCHED),
+    (0.0, 0.0, 0.0), (1.5, 0.0, 0.0), (_COHERENCE, 0.0, 0.0), (0.0, _UNMATCHED, 0.0),
+    (0.0, 0.0, _SUPPORT), (_COHERENCE, _UNMATCHED, 0.0), CHOICE_WEIGHTS,
+    (_COHERENCE / 2, _UNMATCHED, _SUPPORT), (2 * _COHERENCE, _UNMATCHED, _SUPPORT),
+    (_COHERENCE, _UNMATCHED / 2, _SUPPORT), (_COHERENCE, 2 * _UNMATCHED, _SUPPORT),
+    (_COHERENCE, _UNMATCHED, _SUPPORT / 2), (_COHERENCE, _UNMATCHED, 2 * _SUPPORT),
 )  # fmt: skip
 PAIRS: dict[benchmark.Protocol, int] = {"real": 200, "views": 120, "clean": 80}
 ANCHORS = 64, 256
@@ -57,20 +59,8 @@ _SEED = 5  # of pairs that nothing else uses
 class CandidateTables(NamedTuple):
     """What candidates are worth; the last of them is the true transform."""
 
-    measures: np.ndarray  # (2, T + 1, 3) agreement, coherence, unmatched loss; after EM-ICP, too
+    measures: np.ndarray  # (T + 1, 4) agreement, coherence, unmatched loss, support
     errors: np.ndarray  # (2, T + 1, 2) degrees and ADD-S, after generalised ICP and after EM-ICP
-
-    def choose(self, weights: tuple[float, float], shortlist: int, truth: bool = False) -> int:
-        """Choose the best of the shortlist after EM-ICP.
-
-        Args:
-            weights: of coherence and unmatched loss.
-            shortlist: how many EM-ICP refines.
-            truth: whether the true transform is a candidate.
-        """
-        before, after = self.measures if truth else self.measures[:, :-1]
-        best = ranking(before, weights)[:shortlist]
-        return int(best[ranking(after[best], weights)[0]])
 
 
 class PairTables(NamedTuple):
@@ -99,11 +89,10 @@ def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> Pair
         start = [scorer.refine(each, steps) for each in (*hypotheses.transforms, truth)]
         candidates = np.stack([*distinct(np.stack(start[:-1])), start[-1]])
         gicp = [scorer.refine(each) for each in candidates]
-        em = refine_shortlist(candidates, hypotheses, subsamples)
-        final = [refine_chosen(each, hypotheses, subsamples, scorer) for each in em]
+        em = [refine_chosen(each, hypotheses, subsamples, scorer) for each in candidates]
         return CandidateTables(
-            np.stack([measure(each, hypotheses, scorer) for each in (candidates, em)]),
-            np.stack([errors_of(each) for each in (gicp, final)]),
+            measure(candidates, hypotheses, subsamples, scorer),
+            np.stack([errors_of(each) for each in (gicp, em)]),
         )
 
     return PairTables(
@@ -130,18 +119,14 @@ def matches_of(
 
 def outcomes(table: PairTables) -> dict[str, np.ndarray]:
     """Return the errors (2,) of one pair for all weights and refinements."""
-    in_use, more_steps = table.in_use, table.more_steps
-    gicp, em = in_use.errors
-    rows = {f"{a}, {b}": em[in_use.choose((a, b), 1)] for a, b in TRIED}
-    for shortlist in (SHORTLIST, 2 * SHORTLIST):
-        name = f"in use, {shortlist} candidates refined by EM-ICP before the choice"
-        rows[name] = em[in_use.choose(CHOICE_WEIGHTS, shortlist)]
+    measures, (gicp, em) = table.in_use
+    rows = {", ".join(map(str, tried)): em[choose(measures[:-1], tried)] for tried in TRIED}
     name = f"in use, {STEPS_WITHOUT_MATCHES} steps of generalised ICP for each candidate"
-    rows[name] = more_steps.errors[1][more_steps.choose(CHOICE_WEIGHTS, SHORTLIST)]
+    more = table.more_steps
+    rows[name] = more.errors[1][choose(more.measures[:-1], CHOICE_WEIGHTS)]
     rows["best candidate"] = em[:-1].min(0)
-    with_truth = in_use.choose(CHOICE_WEIGHTS, SHORTLIST, truth=True)
-    rows["in use, the truth among the candidates"] = em[with_truth]
-    rows["in use, generalised ICP alone"] = gicp[in_use.choose(CHOICE_WEIGHTS, 1)]
+    rows["in use, the truth among the candidates"] = em[choose(measures, CHOICE_WEIGHTS)]
+    rows["in use, generalised ICP alone"] = gicp[choose(measures[:-1], CHOICE_WEIGHTS)]
     rows["the truth, after generalised ICP"] = gicp[-1]
     for prior, errors in zip(PRIORS, table.refined_truth, strict=True):
         rows[f"the truth, after EM-ICP {prior}"] = errors
@@ -172,12 +157,12 @@ def main() -> None:
         content[protocol] = {
             "pairs": len(tables),
             "candidates": float(np.mean([table.candidates for table in tables])),
-            "distinct": float(np.mean([len(table.in_use.errors[0]) - 1 for table in tables])),
+            "distinct": float(np.mean([len(table.in_use.measures) - 1 for table in tables])),
             "weights": {name: shares([row[name] for row in rows]) for name in rows[0]},
             "right_matches": dict(zip(map(str, ANCHORS), means, strict=True)),
         }
     print(json.dumps(content, indent=1))
-    PATH.write_text(json.dumps(content, indent=1) + "\n")
+    replace_text(PATH, json.dumps(content, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -28,7 +28,12 @@ from corrmat.ops.correspondence import MatchabilityCorrespondence, SoftCorrespon
 from corrmat.registration import example
 from corrmat.registration import register as registration
 from corrmat.registration.animation import registration_gif
-from corrmat.registration.hypotheses import Hypotheses, rough_agreement, unmatched_nll
+from corrmat.registration.hypotheses import (
+    Hypotheses,
+    NetworkHypotheses,
+    rough_agreement,
+    unmatched_nll,
+)
 from corrmat.registration.scene import build_scene, extent
 from corrmat.registration.scoring import AlignmentScorer
 from corrmat.registration.view import registration_page
@@ -604,10 +609,11 @@ def test_only_a_network_with_matchabilities_says_which_points_have_no_match(gene
     assert unmatched_nll(SoftCorrespondence(f_x, f_y, 1.0, m_x)) is None  # of the source alone
 
 
-def test_candidates_are_ranked_by_the_weighted_sum_of_their_measures():
-    measures = np.array([[0.5, 0.1, 0.1], [0.6, 0.1, 0.5], [0.1, 0.0, 0.0], [0.5, 0.1, 0.1]])
-    assert registration.ranking(measures, (10.0, -1.0)).tolist() == [0, 3, 1, 2]
-    assert registration.ranking(measures, (0.0, 0.0)).tolist() == [1, 0, 3, 2]
+def test_the_candidate_of_the_largest_weighted_sum_is_chosen():
+    measures = np.array([[0.5, 0.1, 0.1, 0.5], [0.6, 0.1, 0.5, 0.2], [0.5, 0.1, 0.1, 0.5]])
+    assert registration.choose(measures, (0.0, 0.0, 0.0)) == 1
+    assert registration.choose(measures, (0.0, -1.0, 0.0)) == 0  # the first of two equal ones
+    assert registration.choose(measures, (0.0, 0.0, 0.5)) == 0
 
 
 def test_a_transform_that_is_nearly_an_earlier_one_is_dropped():
@@ -620,19 +626,16 @@ def test_a_transform_that_is_nearly_an_earlier_one_is_dropped():
     np.testing.assert_array_equal(registration.distinct(transforms[:1]), transforms[:1])
 
 
-def test_the_best_of_the_refined_shortlist_is_chosen(pair, monkeypatch):
-    """The better candidate after EM-ICP wins, whatever the order before."""
+def test_the_choice_is_by_agreement_coherence_unmatched_loss_and_support(pair):
+    """Of the truth and a half turn, put first, the truth wins, and by each measure's own weight."""
     _, source, target, truth = pair
-    refined = []
-
-    def refine(transforms, hypotheses, subsamples):
-        best = original(transforms, hypotheses, subsamples)
-        turned = best[0] @ np.diag([-1.0, -1.0, 1.0, 1.0])
-        refined.append(turned)
-        return np.stack([turned, best[0]])
-
-    original = registration.refine_shortlist
-    monkeypatch.setattr(registration, "refine_shortlist", refine)
-    found = corrmat.register(source, target).transform
-    assert len(refined) == 1
-    assert angle_deg(found, truth) < 2
+    (x, y), scale, subsamples, scorer = registration.prepare_clouds(source, target, 0)
+    hypotheses = NetworkHypotheses(load_model())(*subsamples, 0)
+    rotation = truth[:3, :3]
+    shift = scale * (rotation @ x.centre + truth[:3, 3] - y.centre)
+    transforms = np.stack([rigid.to_homogeneous(rotation, shift)] * 2)
+    transforms[0, :3, :3] @= np.diag([-1.0, -1.0, 1.0])
+    wrong, right = registration.measure(transforms, hypotheses, subsamples, scorer)
+    better = np.sign([1.0, *registration.CHOICE_WEIGHTS]) * (right - wrong)
+    assert (better[[0, 2, 3]] > 0).all()
+    assert registration.choose(np.stack([wrong, right]), registration.CHOICE_WEIGHTS) == 1

@@ -28,14 +28,15 @@ Refine = Literal["icp", "none"]
 MODEL_POINTS = 1024  # points of either cloud for the model
 SELECTION_POINTS = 2048  # to select among its hypotheses
 FULL_POINTS = 20_000  # to refine the selected one
-# A candidate scores agreement + these times coherence and unmatched loss; benchmarks/choice.py.
-CHOICE_WEIGHTS = 4.0, -1.0
-WITHOUT_MATCHABILITIES = 1.5, 0.0  # for models that have none: no unmatched loss
+# A candidate scores agreement + these times coherence, unmatched loss and support;
+# benchmarks/choice.py.
+CHOICE_WEIGHTS = 4.0, -1.0, 0.2
+WITHOUT_MATCHABILITIES = 1.5, 0.0, 0.0  # for models that have none: no unmatched loss
 CANDIDATE_STEPS = 5  # of generalised ICP, for each candidate; EM-ICP with matches does the rest
 STEPS_WITHOUT_MATCHES = 30  # the same for models that have none
 SAME_TRANSFORM = 0.1  # difference of two matrices: a turn by 4 degrees, or a shift by 0.1
-SHORTLIST = 2  # best candidates, which EM-ICP refines before one is chosen
-SHORTLIST_POINTS = 400  # of either cloud, for that refinement
+COARSE_POINTS = 400  # of either cloud, for EM-ICP's first iterations
+FINE_ITERATIONS = 4  # of EM-ICP, the last, on all points of the model
 MEDIAN = 0.6  # median distance from the centroid after scaling: a radius of about one
 NORMAL_TOLERANCE = 0.01  # by which the length of a given normal may differ from one
 FAR = 30.0  # median distances from the middle: a point beyond is a stray one and left out
@@ -116,17 +117,11 @@ def register(
     hypotheses = generate(*subsamples, seed)
     weights = WITHOUT_MATCHABILITIES if hypotheses.unmatched_nll is None else CHOICE_WEIGHTS
 
-    def ranked(transforms: np.ndarray) -> np.ndarray:
-        return transforms[ranking(measure(transforms, hypotheses, scorer), weights)]
-
     candidates = hypotheses.transforms
     if refine == "icp":
         steps = STEPS_WITHOUT_MATCHES if hypotheses.prob is None else CANDIDATE_STEPS
         candidates = distinct(np.stack([scorer.refine(t, steps) for t in candidates]))
-    candidates = ranked(candidates)
-    if refine == "icp":
-        candidates = ranked(refine_shortlist(candidates[:SHORTLIST], hypotheses, subsamples))
-    transform = candidates[0]
+    transform = candidates[choose(measure(candidates, hypotheses, subsamples, scorer), weights)]
     full = scorer
     if max(len(x.rows), len(y.rows)) > SELECTION_POINTS:
         full = AlignmentScorer(x.points(scale, FULL_POINTS), y.points(scale, FULL_POINTS))
@@ -184,41 +179,39 @@ def distinct(transforms: np.ndarray) -> np.ndarray:
     return kept
 
 
-def measure(transforms: np.ndarray, hypotheses: Hypotheses, scorer: AlignmentScorer) -> np.ndarray:
+def measure(
+    transforms: np.ndarray,
+    hypotheses: Hypotheses,
+    subsamples: tuple[np.ndarray, np.ndarray],
+    scorer: AlignmentScorer,
+) -> np.ndarray:
     """Measure what the choice among transforms weighs.
 
     Args:
         transforms: (T, 4, 4).
         hypotheses: of the model.
-        scorer: of the clouds to measure the transforms on; the model had their first points.
+        subsamples: the clouds that they were made from.
+        scorer: of the clouds to measure the transforms on; their first points are the model's.
 
     Returns:
-        (T, 3): agreement, coherence, unmatched loss.
+        (T, 4): agreement, coherence, unmatched loss, support.
     """
-    found = [scorer.alignment(transform) for transform in transforms]
-    rows = [(a.agreement, a.coherence, hypotheses.unmatched_loss(a.distances)) for a in found]
+    rows = []
+    for transform in transforms:
+        agreement, coherence, distances = scorer.alignment(transform)
+        support = hypotheses.support(transform, *subsamples)
+        rows.append((agreement, coherence, hypotheses.unmatched_loss(distances), support))
     return np.array(rows)
 
 
-def ranking(measures: np.ndarray, weights: tuple[float, float]) -> np.ndarray:
-    """Rank candidates by their score: (T,) indices, best first.
+def choose(measures: np.ndarray, weights: tuple[float, float, float]) -> int:
+    """Choose the candidate of the highest score.
 
     Args:
-        measures: (T, 3) of `measure`.
-        weights: of coherence and unmatched loss, beside agreement's 1.
+        measures: (T, 4) of `measure`.
+        weights: of coherence, unmatched loss and support, beside agreement's 1.
     """
-    return np.argsort(-(measures @ [1.0, *weights]), kind="stable")
-
-
-def refine_shortlist(
-    transforms: np.ndarray, hypotheses: Hypotheses, subsamples: tuple[np.ndarray, np.ndarray]
-) -> np.ndarray:
-    """Refine transforms (T, 4, 4) by EM-ICP on few points: (T, 4, 4)."""
-    source, target = (cloud[:SHORTLIST_POINTS] for cloud in subsamples)
-    prob = hypotheses.prob
-    if prob is not None:
-        prob = prob[: len(source), : len(target)]
-    return np.stack([em_icp(transform, source, target, prob) for transform in transforms])
+    return int(np.argmax(measures @ [1.0, *weights]))
 
 
 def refine_chosen(
@@ -227,11 +220,10 @@ def refine_chosen(
     subsamples: tuple[np.ndarray, np.ndarray],
     full: AlignmentScorer,
 ) -> np.ndarray:
-    """Refine the chosen transform (4, 4) on all of the model's points, by EM-ICP.
+    """Refine the chosen transform (4, 4) by EM-ICP on the model's points.
 
-    If the shortlist was refined on as many points, that has been done. Else the last iterations
-    are enough, if the model has matches. Generalised ICP follows where it is more exact: on points
-    that the model has not seen, and on points that both clouds share.
+    With matches, a few points are enough for the first iterations. Generalised ICP follows where
+    it is more exact: on points that the model has not seen, and on points that both clouds share.
 
     Args:
         transform: of the source onto the target.
@@ -239,9 +231,12 @@ def refine_chosen(
         subsamples: the clouds that they were made from.
         full: scorer of the clouds, with all their points.
     """
-    if max(map(len, subsamples)) > SHORTLIST_POINTS:
-        widths = WIDTHS if hypotheses.prob is None else WIDTHS[-4:]
-        transform = em_icp(transform, *subsamples, hypotheses.prob, widths)
+    prob, widths = hypotheses.prob, WIDTHS
+    if prob is not None:
+        coarse, widths = np.split(WIDTHS, [-FINE_ITERATIONS])
+        source, target = (cloud[:COARSE_POINTS] for cloud in subsamples)
+        transform = em_icp(transform, source, target, prob[: len(source), : len(target)], coarse)
+    transform = em_icp(transform, *subsamples, prob, widths)
     more = max(len(full.source), len(full.target)) > MODEL_POINTS
     return full.refine(transform) if more or full.shares_points(transform) else transform
 

@@ -105,7 +105,7 @@ def _aligned(per_pair: Mapping[str, list[float]]) -> list[bool]:
 def held_out_pairs(
     protocol: benchmark.Protocol, count: int, seed: int, points: int = 512
 ) -> PairBatch:
-    """Make pairs of the families' shapes that `make weights` does not train on.
+    """Make pairs of the families' shapes that no training of the network but the first saw.
 
     Args:
         protocol: one of `benchmark.PROTOCOLS`.
@@ -113,7 +113,7 @@ def held_out_pairs(
         seed: of crops, noise and poses.
         points: of a cloud before it is cropped.
     """
-    # The shapes that the first runs held out. Later runs train on new ones alone.
+    # The shapes that runs held out until each pair got a new one.
     clouds = RegistrationDataModule(data="shapes+assemblies").clouds("val")
     families = np.flatnonzero([clouds.names[label] != "assembly" for label in clouds.labels])
     spread = np.linspace(0, len(families) - 1, min(count, len(families))).round().astype(int)
