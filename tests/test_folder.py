@@ -2,6 +2,8 @@
 
 import json
 import logging
+import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -115,3 +117,12 @@ def test_a_run_on_a_folder_leaves_its_record_under_its_name(modelnet, tmp_path, 
     record = json.loads((tmp_path / "results/smoke/boxes/3.2/metrics.json").read_text())
     assert (record["data"], record["arms"]["PCRNet"]["pairs"]) == ("boxes", 4)
     assert str(modelnet) not in (tmp_path / "results/smoke/boxes/3.2/config.yaml").read_text()
+
+
+def test_a_file_name_need_not_be_utf8(tmp_path):
+    name = os.fsdecode(b"caf\xe9.npy")
+    for path in (tmp_path / name, tmp_path / "b.npy"):
+        np.save(path, np.random.default_rng(0).normal(size=(2048, 3)))
+    found = [file for split in ("train", "test") for file in folder.find_shapes(tmp_path, split)[1]]
+    assert sorted(Path(file.path).name for file in found) == ["b.npy", name]
+    assert all(not isinstance(folder.sample_shape(file), str) for file in found)

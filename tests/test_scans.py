@@ -1,8 +1,11 @@
 """Files of anybody's clouds: every format gives the same points, a damaged file one clear line."""
 
+import io
+
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from corrmat.data.scans import CLOUDS, MESHES, read_scan, write_ply
 from corrmat.errors import CorrmatError
@@ -75,9 +78,11 @@ def test_an_empty_cell_of_a_table_keeps_its_place(tmp_path):
     assert read_scan(tmp_path / "table.csv").tolist() == [[4, 5, 6], [1, 2, 3], [0, 0, 1]]
 
 
-@pytest.mark.parametrize("header", ["id,x,y,z", "label x y z", '"n","X","Y","Z"', "//N X Y Z"])
+@pytest.mark.parametrize(
+    "header", ["id,x,y,z", "label x y z", '"n","X","Y","Z"', "//N X Y Z", "// N X Y Z", "n;x;y;z"]
+)
 def test_the_names_of_columns_say_which_are_the_coordinates(tmp_path, header):
-    separator = "," if "," in header else " "
+    separator = next((mark for mark in ",;" if mark in header), " ")
     rows = [separator.join(["7", *map(repr, map(float, row))]) for row in POINTS]
     (tmp_path / "table.csv").write_text("\n".join([header, *rows]))
     assert np.abs(read_scan(tmp_path / "table.csv") - POINTS).max() < 1e-12
@@ -94,19 +99,54 @@ def test_three_points_with_normals_are_three_points(tmp_path):
     assert read_scan(tmp_path / "three.npy").tolist() == POINTS[:3].tolist()
 
 
-def test_pixels_of_a_pcd_without_a_measurement_are_left_out(tmp_path):
-    rows = [f"{x} {y} {z}" for x, y, z in POINTS[:4]]
-    head = ["VERSION .7", "FIELDS x y z", "SIZE 4 4 4", "TYPE F F F", "COUNT 1 1 1", "WIDTH 6"]
-    head += ["HEIGHT 1", "VIEWPOINT 0 0 0 1 0 0 0", "POINTS 6", "DATA ascii"]
-    text = "\n".join([*head, "nan nan nan", *rows, "nan nan nan", ""])
-    (tmp_path / "depth.pcd").write_text(text)
-    np.testing.assert_allclose(read_scan(tmp_path / "depth.pcd"), POINTS[:4], rtol=1e-6)
+@pytest.mark.parametrize("kind", [".ply", *CLOUDS])
+def test_pixels_without_a_measurement_are_left_out(tmp_path, kind):
+    holes = np.insert(POINTS, (0, 7, 40), np.nan, axis=0)
+    scan = read_scan(write(tmp_path / f"depth{kind}", holes))
+    np.testing.assert_allclose(scan, POINTS, rtol=1e-6)
+
+
+def test_a_comment_may_be_in_any_encoding(tmp_path):
+    (tmp_path / "latin.xyz").write_bytes("# Körper\n1 2 3\n4 5 6\n".encode("latin-1"))
+    assert read_scan(tmp_path / "latin.xyz").tolist() == [[1, 2, 3], [4, 5, 6]]
+    write_ply(tmp_path / "latin.ply", POINTS)
+    content = (tmp_path / "latin.ply").read_bytes()
+    for encoding in ("latin-1", "utf-8"):
+        comment = "ply\ncomment Körper".encode(encoding)
+        (tmp_path / "latin.ply").write_bytes(content.replace(b"ply", comment, 1))
+        assert (read_scan(tmp_path / "latin.ply") == POINTS).all()
+
+
+def test_points_of_a_ply_with_edges_are_points(tmp_path):
+    write_ply(tmp_path / "lines.ply", POINTS)
+    header, _, body = (tmp_path / "lines.ply").read_bytes().partition(b"end_header\n")
+    edges = b"element edge 1\nproperty int vertex1\nproperty int vertex2\nend_header\n"
+    (tmp_path / "lines.ply").write_bytes(header + edges + body + np.array([0, 1], "<i4").tobytes())
+    assert (read_scan(tmp_path / "lines.ply") == POINTS).all()
+
+
+def test_textures_are_not_read(tmp_path, monkeypatch):
+    """Those of a photograph take more memory than its mesh."""
+    box = trimesh.creation.box((2, 2, 2))
+    uv = np.zeros((len(box.vertices), 2))
+    box.visual = trimesh.visual.TextureVisuals(uv, image=Image.new("RGB", (4, 4)))
+    box.export(tmp_path / "box.glb")
+    opened = []
+    monkeypatch.setattr(Image, "open", opened.append)
+    assert np.allclose(np.abs(read_scan(tmp_path / "box.glb")).max(1), 1, atol=1e-6)
+    assert opened == []
 
 
 def test_a_ply_keeps_millimetres_at_ten_thousand_kilometres(tmp_path):
     far = POINTS + 1e7
     write_ply(tmp_path / "far.ply", far)
     assert (read_scan(tmp_path / "far.ply") == far).all()
+
+
+def _bytes_of(array):
+    content = io.BytesIO()
+    np.save(content, array)
+    return content.getvalue()
 
 
 @pytest.mark.parametrize(
@@ -117,7 +157,12 @@ def test_a_ply_keeps_millimetres_at_ten_thousand_kilometres(tmp_path):
         ("cloud", b"x", "without a suffix"),
         ("empty.ply", b"", "is empty"),
         ("empty.xyz", b"\n\n", "holds no points"),
-        ("words.txt", b"one two three\n", "cannot be read as TXT"),
+        ("words.txt", b"one two three\n", "the header names one, two, three"),
+        ("words.xyz", b"1 2 3\none two 3\n", "cannot be read as XYZ"),
+        ("header.csv", b"x,y,z\n", "holds no points"),
+        ("german.csv", b"x;y;z\n1,5;2,5;3,5\n", "need a decimal point"),
+        ("complex.npy", _bytes_of(np.ones((9, 3), complex)), "complex128"),
+        ("side.npy", _bytes_of(np.ones((4, 40))), "transpose it"),
         ("german.txt", b"1,5 2,5 3,5\n2,0 1,0 0,5\n", "need a decimal point"),
         ("short.txt", b"1 2 3\n4 5\n", "row 2 holds 2 numbers"),
         ("words.csv", b"x,y\nz,u\n", "the header names x, y, but not x, y and z"),

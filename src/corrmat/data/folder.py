@@ -8,6 +8,7 @@ split.
 
 import hashlib
 import logging
+import os
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +18,7 @@ import trimesh
 from corrmat.data.build import build_shards
 from corrmat.data.clouds import CloudSet, cache_folder, open_shards, skipped_shapes
 from corrmat.data.normals import estimate_normals
-from corrmat.data.scans import MESHES, read_mesh, read_scan
+from corrmat.data.scans import MESHES, read_shape
 from corrmat.errors import CorrmatError
 
 log = logging.getLogger("corrmat")
@@ -70,7 +71,9 @@ def load(split: str, count: int | None = None, root: Path | None = None) -> Clou
     identity = [
         (f.relative, Path(f.path).stat().st_size, Path(f.path).stat().st_mtime_ns) for f in files
     ]
-    digest = hashlib.sha256(repr((root.resolve().as_posix(), identity)).encode()).hexdigest()[:12]
+    digest = hashlib.sha256(os.fsencode(repr((root.resolve().as_posix(), identity)))).hexdigest()[
+        :12
+    ]
     shards = cache_folder() / f"folder-{root.name}-{digest}-{split}"
     clouds = open_shards(shards)
     if clouds is None:
@@ -113,20 +116,19 @@ def sample_shape(file: ShapeFile) -> tuple[np.ndarray, int] | str:
     They are centred at their mean and scaled into the unit sphere. The sample depends on the
     file's path in the folder alone.
     """
-    rng = np.random.default_rng(list(hashlib.sha256(file.relative.encode()).digest()))
+    rng = np.random.default_rng(list(hashlib.sha256(os.fsencode(file.relative)).digest()))
     path = Path(file.path)
     try:
-        mesh = read_mesh(path) if path.suffix.lower() in MESHES else None
-        if mesh is not None:
-            points, faces = trimesh.sample.sample_surface(mesh, POINTS, seed=rng)[:2]
-            normals = mesh.face_normals[faces]
-        else:
-            points, normals = read_scan(path), None
-            if len(points) < POINTS:
-                return f"{file.relative}: {len(points)} points, {POINTS} are needed"
-            points = points[rng.choice(len(points), POINTS, replace=False)]
+        shape = read_shape(path)
     except CorrmatError as error:
         return str(error)
+    if isinstance(shape, trimesh.Trimesh):
+        points, faces = trimesh.sample.sample_surface(shape, POINTS, seed=rng)[:2]
+        normals = shape.face_normals[faces]
+    else:
+        if len(shape) < POINTS:
+            return f"{file.relative}: {len(shape)} points, {POINTS} are needed"
+        points, normals = shape[rng.choice(len(shape), POINTS, replace=False)], None
     points = points - points.mean(0)
     radius = np.linalg.norm(points, axis=1).max()
     if not np.isfinite(radius) or radius == 0:
@@ -142,5 +144,5 @@ def _split_folder(relative: Path) -> str | None:
 
 
 def _split_by_hash(relative: Path) -> str:
-    digest = hashlib.sha256(relative.as_posix().encode()).digest()
+    digest = hashlib.sha256(os.fsencode(relative.as_posix())).digest()
     return "test" if int.from_bytes(digest[:4], "big") < TEST_SHARE * 2**32 else "train"
