@@ -107,6 +107,7 @@ def test_corrmat_alone_says_what_it_can_do(capsys):
         (["compare", "icp", "--config", "x.yaml"], "nrecognized arguments: --config"),
         (["compare", "icp", "--keep", "1"], "nrecognized arguments: --keep"),
         (["compare", "icp", "--record", "file/x.json"], "cannot write to file"),
+        (["compare", "icp", "--record", "."], "is a folder, not a file"),
         ([*FIT, "--runs", "file/x"], "cannot write to file/x"),
         ([*FIT, "--seed", "5000000000"], "seed 5000000000 is not between"),
         (["robustness", "--scale", "smoke", "--results", "file/x"], "cannot write to file/x"),

@@ -102,11 +102,11 @@ def test_the_command_moves_every_scan_onto_the_last(tmp_path, monkeypatch, capsy
         points = cloud[part::3] @ pose[:3, :3].T + pose[:3, 3]
         write_ply(tmp_path / f"{name}.ply", points)
     monkeypatch.chdir(tmp_path)
-    assert main(["register", "a.ply", "b.ply", "c.ply", "-o", "moved", "--json", "out.json"]) == 0
+    assert main(["register", "a.ply", "b.ply", "c.ply", "-o", "moved", "--json", "moved/out.json"]) == 0
     printed = capsys.readouterr().out
     assert "a.ply" in printed
     assert "b.ply" in printed
-    result = json.loads((tmp_path / "out.json").read_text())
+    result = json.loads((tmp_path / "moved" / "out.json").read_text())
     assert [scan["scan"] for scan in result["scans"]] == ["a.ply", "b.ply"]
     for part, scan in enumerate(result["scans"]):
         truth = poses[2] @ np.linalg.inv(poses[part])
@@ -122,6 +122,7 @@ def test_the_command_moves_every_scan_onto_the_last(tmp_path, monkeypatch, capsy
         (["a.ply", "b.ply", "c.ply", "--html", "x.html"], "two scans"),
         (["a.ply", "b.ply", "c.ply", "-o", "out.ply"], "folder"),
         (["a.ply", "b.ply", "c.ply", "-o", "a.ply/moved"], "cannot write"),
+        (["a.ply", "b.ply", "c.ply", "-o", "m", "--json", "m/b.ply"], "named for two results"),
         (["a.ply"], "target"),
     ],
 )

@@ -356,6 +356,16 @@ def test_no_scan_is_overwritten(words, tmp_path, monkeypatch, capsys):
     assert {path: path.read_bytes() for path in tmp_path.glob("*.ply")} == before
 
 
+@pytest.mark.parametrize(("command", "name"), [("example", "source.ply"), ("export", "README.md")])
+def test_files_of_a_user_are_not_overwritten(command, name, tmp_path, capsys):
+    (tmp_path / name).write_text("mine")
+    assert main([command, str(tmp_path)]) == 2
+    assert "is there already" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    (tmp_path / name).unlink()
+    assert main([command, str(tmp_path)]) == main([command, str(tmp_path)]) == 0  # twice is fine
+
+
 def test_results_go_through_links_and_into_pipes(pair, tmp_path):
     folder = pair[0]
     scans = [str(folder / "source.ply"), str(folder / "target.ply"), "--model", "icp"]
@@ -363,6 +373,9 @@ def test_results_go_through_links_and_into_pipes(pair, tmp_path):
     assert main(["register", *scans, "--json", str(tmp_path / "link.json")]) == 0
     assert (tmp_path / "link.json").is_symlink()
     assert json.loads((tmp_path / "real.json").read_text())["model"] == "icp"
+    into, out_of = os.pipe()[::-1]
+    assert main(["register", *scans, "--json", f"/dev/fd/{into}"]) == 0
+    assert json.loads(os.read(out_of, 10_000))["model"] == "icp"
     os.mkfifo(tmp_path / "pipe")
     reader = subprocess.Popen(["cat", str(tmp_path / "pipe")], stdout=subprocess.PIPE)
     assert main(["register", *scans, "--json", str(tmp_path / "pipe")]) == 0

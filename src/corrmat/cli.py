@@ -220,6 +220,7 @@ def _compare(options: Namespace) -> int:
     from corrmat.registration import benchmark
 
     if options.record is not None:
+        _refuse_folder(options.record)
         ensure_writable(options.record.parent)
     about = {name: options[name] for name in ("protocol", "data", "points")}
     if options.protocol == "rooms":
@@ -245,12 +246,17 @@ def _register(options: Namespace) -> int:
     for path in filter(None, files):
         if written.count(path.resolve()) > 1:
             raise CorrmatError(f"{path} is named for two results, and one would be lost")
-        if path.is_dir():
-            raise CorrmatError(f"{path} is a folder, not a file to write")
-        if not path.parent.is_dir():
+        _refuse_folder(path)
+        if not path.parent.is_dir() and path.parent != options.output:
             raise CorrmatError(f"no folder {path.parent} to write {path.name} into")
         _keep_scans(options, path)
     return (_register_several if several else _register_pair)(options)
+
+
+def _refuse_folder(path: Path) -> None:
+    """Refuse a folder where a file is to be written."""
+    if path.is_dir():
+        raise CorrmatError(f"{path} is a folder, not a file to write")
 
 
 def _keep_scans(options: Namespace, written: Path) -> None:
@@ -308,8 +314,10 @@ def _register_several(options: Namespace) -> int:
             raise CorrmatError(f"{options.output}: with several scans, --output is a folder")
         if len(set(names)) < len(names):
             raise CorrmatError(f"two scans would both be written to {options.output}: rename one")
-        for name in names:
-            _keep_scans(options, options.output / name)
+        for moved in (options.output / name for name in names):
+            _keep_scans(options, moved)
+            if options.json is not None and options.json.resolve() == moved.resolve():
+                raise CorrmatError(f"{moved} is named for two results, and one would be lost")
         ensure_writable(options.output)
     from corrmat.data.scans import read_scan, write_ply
 

@@ -20,10 +20,10 @@ def replace_bytes(path: Path, content: bytes | memoryview) -> None:
     Raises:
         OSError: the file cannot be written; the temporary file is removed.
     """
-    path = path.resolve()
     if path.exists() and not path.is_file():
         path.write_bytes(content)
         return
+    path = path.resolve()
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
         partial.write_bytes(content)

@@ -149,7 +149,8 @@ def export_model(model: str | Path, folder: str | Path) -> None:
         folder: to write into; it is made.
 
     Raises:
-        CorrmatError: there are no such weights, or they are an exported model.
+        CorrmatError: there are no such weights, or they are an exported model; the folder holds
+            files of these names that are none.
     """
     model, folder = str(model), Path(folder)
     if model == "corrmat" or model in shipped_models():
@@ -166,10 +167,18 @@ def export_model(model: str | Path, folder: str | Path) -> None:
         content = _to_safetensors(network, about)
         card = _FRONT + f"# {method}\n\n    network = corrmat.load_model(folder)\n"
     config = {"library_name": "corrmat", **about, "network": json.loads(about["network"])}
+    files = {
+        _MODEL_FILE: content,
+        "config.json": (json.dumps(config, indent=1) + "\n").encode(),
+        "README.md": card.encode(),
+    }
+    if not (folder / _MODEL_FILE).exists():  # it is not an earlier export
+        for path in map(folder.joinpath, files):
+            if path.exists():
+                raise CorrmatError(f"{path} is there already; choose another folder")
     folder.mkdir(parents=True, exist_ok=True)
-    replace_bytes(folder / _MODEL_FILE, content)
-    replace_bytes(folder / "config.json", (json.dumps(config, indent=1) + "\n").encode())
-    replace_bytes(folder / "README.md", card.encode())
+    for name, written in files.items():
+        replace_bytes(folder / name, written)
 
 
 def _to_safetensors(network: nn.Module, metadata: Mapping[str, str]) -> bytes:

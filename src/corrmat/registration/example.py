@@ -25,12 +25,16 @@ def write_example(folder: Path) -> None:
     1.5 m apart with a rotation of 130 degrees.
 
     Raises:
-        CorrmatError: the folder cannot be created.
+        CorrmatError: the folder cannot be created, or holds other scans of these names.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise CorrmatError(f"cannot create the folder {folder}: {error.strerror}") from error
+    if not (folder / "truth.json").exists():  # it is not an earlier example
+        for name in ("source.ply", "target.ply"):
+            if (folder / name).exists():
+                raise CorrmatError(f"{folder / name} is there already; choose another folder")
     rng = np.random.default_rng(0)
     points = MILLIMETRES * make_shape(("test", SHAPE))[0][:, :3].astype(np.float64)
     order = rng.permutation(len(points))
