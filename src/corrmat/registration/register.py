@@ -40,6 +40,7 @@ FINE_ITERATIONS = 4  # of EM-ICP, the last, on all points of the model
 MEDIAN = 0.6  # median distance from the centroid after scaling: a radius of about one
 NORMAL_TOLERANCE = 0.01  # by which the length of a given normal may differ from one
 FAR = 30.0  # median distances from the middle: a point beyond is a stray one and left out
+OTHER_SIZE = 8.0  # times as large: two such clouds may have different units
 _LINE = 1e-6  # a cloud that is thinner, relative to its length, is a line
 
 
@@ -127,29 +128,43 @@ def register(
         full = AlignmentScorer(x.points(scale, FULL_POINTS), y.points(scale, FULL_POINTS))
     if refine == "icp":
         transform = refine_chosen(transform, hypotheses, subsamples, full)
-    agreement, support = (
-        scorer.alignment(transform).agreement,
-        hypotheses.support(transform, *subsamples),
-    )
-    has_matches = len(hypotheses.matches) > 0
-    confidence = _calibration().confidence(agreement, support if has_matches else None)
+    agreement = scorer.alignment(transform).agreement
+    support = hypotheses.support(transform, *subsamples)
+    agrees = hypotheses.match_support(transform, *subsamples) > 0
+    confidence = _calibration().confidence(agreement, support if len(agrees) else None)
     overlap, rmse = full.overlap_and_rmse(transform)
     rows = [cloud.rows[m] for cloud, m in zip((x, y), hypotheses.matches.T, strict=True)]
     return Registration(
         transform=to_original_units(transform, scale, x.centre, y.centre),
         matches=np.stack(rows, 1),
         match_confidence=hypotheses.confidence,
-        match_agrees=hypotheses.match_support(transform, *subsamples) > 0,
+        match_agrees=agrees,
         agreement=agreement,
         support=support,
         confidence=confidence,
         rmse=rmse / scale,
         overlap=overlap,
-        verdict=verdict(confidence, f"{overlap:.0%} of the source lies on the target"),
+        verdict=verdict(confidence, _reason(agrees, overlap, x.median / y.median)),
         model=str(model),
         seed=seed,
         seconds=time.perf_counter() - start,
     )
+
+
+def _reason(agrees: np.ndarray, overlap: float, size: float) -> str:
+    """Say what a confidence that is not high rests on.
+
+    Args:
+        agrees: (K,) bool, whether the transform explains each match.
+        overlap: share of the source that lies on the target.
+        size: of the source, relative to the target.
+    """
+    reasons = [f"{agrees.sum()} of {len(agrees)} matches agree"] if len(agrees) else []
+    reasons.append(f"{overlap:.0%} of the source lies on the target")
+    if max(size, 1 / size) > OTHER_SIZE:
+        times = f"{max(size, 1 / size):,.0f} times as large"
+        reasons.append(f"one cloud is {times} as the other: do both have the same unit?")
+    return ", ".join(reasons)
 
 
 class PreparedClouds(NamedTuple):
@@ -318,18 +333,19 @@ class Cloud:
 
 
 def is_near(points: np.ndarray, name: str = "cloud") -> np.ndarray:
-    """Tell which points (N, 3) are no stray ones: (N,) bool.
+    """Tell which points (N, 3) are no stray ones: (N,) bool. Copies of a point count once.
 
     Raises:
         CorrmatError: coordinates are too large to be squared.
     """
+    different = np.unique(points, axis=0)
+    middle = np.median(different, axis=0)
     with np.errstate(over="ignore"):
-        distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
-    typical = np.median(distance)
+        distance = np.linalg.norm(points - middle, axis=1)
+        typical = np.median(np.linalg.norm(different - middle, axis=1))
     if not np.isfinite(typical):
         raise CorrmatError(f"{name}: coordinates are too large to compute distances")
-    # Where most points are equal there is no measure.
-    return distance <= FAR * typical if typical else np.ones(len(points), bool)
+    return distance <= FAR * typical
 
 
 def _hash(values: np.ndarray, seed: int) -> np.ndarray:
