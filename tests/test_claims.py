@@ -77,6 +77,7 @@ def test_equal_arms_have_a_large_p_and_others_a_small_one():
         ((1.1, 0.9, 1.3), 1, True, "not shown"),
         ((0.8, 0.7, 0.9), 1, True, "contradicted"),
         ((300, 200, 400), 10, False, "not shown"),  # an opponent that learnt nothing
+        ((math.nan, math.nan, math.nan), None, True, "not shown"),  # neither arm errs at all
     ],
 )
 def test_verdicts(ratio, paper, learnt, verdict):
@@ -104,11 +105,8 @@ def test_sooner_counts_the_pairs_to_the_others_best_error():
         (curve(9, 8, 7, 4), curve(9, 8, 3, 1), "confirmed in direction"),
         (curve(9, 8, 7, 4), curve(9, 8, 7, 4), "not shown"),
         (curve(9, 8, 7, 4), curve(9, 8, 7, 6), "contradicted"),
-        (
-            curve(9, 4, math.nan, 80),
-            curve(9, 8, 3, 1),
-            "contradicted",
-        ),  # diverged
+        (curve(9, 4, math.nan, 80), curve(9, 8, 3, 1), "contradicted"),  # diverged
+        (curve(math.nan, math.nan), curve(9, 8), "not shown"),
     ):
         judged = claims.sooner(evidence(drawn(6.0), drawn(0.3), curves=(baseline, treatment)))
         assert judged.verdict == verdict

@@ -377,27 +377,90 @@ def test_nothing_is_deleted_or_trained_when_the_test_split_cannot_be_read(tmp_pa
     experiment.run(loaded, tmp_path / "results", tmp_path / "runs")
     best = tmp_path / "runs/smoke/shapes/1.1/DCP/best.ckpt"
     before = best.stat().st_mtime_ns
-    for bad in (
-        ["--data.test_shapes", "801"],
-        ["--trainer.accelerator", "warp"],
-        ["--seed", "-1"],
-        ["--network.k", "0"],
-        ["--network.width", "-4"],
-        ["--trainer.max_steps", "-1", "--trainer.max_epochs", "-1"],
-        ["--trainer.max_steps", "-1", "--trainer.max_time", "00:00:01:00"],
-        ["--trainer.accumulate_grad_batches", "0"],
-        ["--trainer.accumulate_grad_batches", "3"],  # validated after 4 batches
-        ["--trainer.accumulate_grad_batches", "2"],  # the same, counted over epochs of 9
-        ["--trainer.max_steps", "0"],
-        ["--trainer.max_steps", "10"],  # of which a cycle rises in one
-        ["--trainer.limit_test_batches", "0"],
-        ["--trainer.val_check_interval", "10", "--trainer.check_val_every_n_epoch", "1"],
-        ["--trainer.devices", "5"],  # of 4 held-out shapes
-        ["--trainer.precision", "16-mixed"],  # cannot clip
-    ):
-        with pytest.raises(CorrmatError):
-            experiment.run(load("1.1", *bad, arms=["DCP"]), tmp_path / "results", tmp_path / "runs")
+    for words, message in (
+        ("--data.test_shapes 801", "801"),
+        ("--trainer.accelerator warp", "accelerator"),
+        ("--seed -1", "seed"),
+        ("--network.k 0", "k"),
+        ("--network.width -4", "--network options"),
+        ("--trainer.max_steps -1 --trainer.max_epochs -1", "one-cycle"),
+        ("--trainer.max_steps -1 --trainer.max_time 00:00:01:00", "one-cycle"),
+        ("--trainer.accumulate_grad_batches 0", "is not positive"),
+        ("--trainer.accumulate_grad_batches 3", "middle of a step"),  # validated after 4 batches
+        ("--trainer.accumulate_grad_batches 2", "middle of a step"),  # over epochs of 9
+        ("--trainer.max_steps 0", "leaves nothing to do"),
+        ("--trainer.max_steps 10", "cannot rise in one step"),
+        ("--trainer.limit_test_batches 0", "limit_test_batches does not go with records"),
+        ("--trainer.limit_train_batches 0.01", "leaves nothing to do"),
+        ("--trainer.limit_val_batches 0.01", "leaves nothing to do"),
+        ("--trainer.fast_dev_run true", "fast_dev_run does not go with records"),
+        ("--trainer.overfit_batches 1", "overfit_batches does not go with records"),
+        ("--trainer.val_check_interval 00:01:00:00", "is not a number of batches"),
+        ("--trainer.val_check_interval 10 --trainer.check_val_every_n_epoch 1", "never comes"),
+        ("--trainer.devices 5", "cannot share 4 held-out shapes"),
+        ("--trainer.devices 2 --trainer.val_check_interval 6 --trainer.check_val_every_n_epoch 1",
+         "never comes in epochs of 4 batches"),
+        ("--trainer.precision 16-mixed", "cannot clip"),
+    ):  # fmt: skip
+        with pytest.raises(CorrmatError, match=message):
+            changed = load("1.1", *words.split(), arms=["DCP"])
+            experiment.run(changed, tmp_path / "results", tmp_path / "runs")
         assert best.stat().st_mtime_ns == before
+    sweep = dataclasses.replace(loaded, sweep_outliers=(0.1, 1.5))
+    with pytest.raises(CorrmatError, match=r"outliers = 1\.5"):
+        experiment.run(sweep, tmp_path / "results", tmp_path / "runs")
+    assert best.stat().st_mtime_ns == before
+
+
+def test_the_run_of_a_record_is_kept_while_others_come_and_go(tmp_path):
+    loaded, folder = load("1.1", arms=["DCP"]), tmp_path / "runs/smoke/shapes/1.1/DCP"
+    experiment.run(loaded, tmp_path / "results", tmp_path / "runs")
+    recorded = (folder / "best.ckpt").read_bytes()
+    other = load("1.1", "--optimizer.lr", "1e-4", arms=["DCP"]).arms["DCP"]
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit):  # noqa: PT012
+        press_ctrl_c("training_step", 5, patch)
+        train(other, folder)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    train(loaded.arms["DCP"], folder)
+    assert (folder.with_name("DCP.previous") / "best.ckpt").read_bytes() == recorded
+    train(other, folder)  # finished, without a record
+    train(loaded.arms["DCP"], folder)
+    assert (folder.with_name("DCP.previous") / "best.ckpt").read_bytes() == recorded
+
+
+def test_a_checkpoint_that_lies_there_by_itself_is_kept(tmp_path):
+    (tmp_path / "DCP").mkdir()
+    (tmp_path / "DCP" / "best.ckpt").write_bytes(b"mine")
+    train(load("1.1").arms["DCP"], tmp_path / "DCP")
+    assert (tmp_path / "DCP.previous" / "best.ckpt").read_bytes() == b"mine"
+
+
+def test_a_checkpoint_of_other_options_is_named(tmp_path, caplog):
+    """Options like the number of neighbours change the answer, but no weight."""
+    arm = load("1.1", arms=["DCP"]).arms["DCP"]
+    trained = train(arm, tmp_path / "DCP")
+    fit.load_trained(prepare(arm), trained.checkpoint)
+    assert "was trained with" not in caplog.text
+    fit.load_trained(
+        prepare(load("1.1", "--network.k", "7", arms=["DCP"]).arms["DCP"]), trained.checkpoint
+    )
+    assert f"was trained with --network.k {arm.network.k}, not 7" in caplog.text
+
+
+def test_a_training_that_is_not_resumed_starts_at_the_first_batch(tmp_path):
+    """Whatever the same DataModule was used for before."""
+    settings = load("1.1", arms=["DCP"]).arms["DCP"]
+    arm = prepare(settings)
+    arm.datamodule.load_state_dict({"epoch": 1, "batches": 2})
+    used, unused = (
+        fit.train(one, tmp_path / name) for one, name in ((arm, "used"), (prepare(settings), "un"))
+    )
+    assert [point["pairs_seen"] for point in used.curve] == [
+        point["pairs_seen"] for point in unused.curve
+    ]
+    assert (
+        (used.curve[-1]["rotation_error_deg_mean"]) == unused.curve[-1]["rotation_error_deg_mean"]
+    )
 
 
 def test_another_seed_has_a_record_of_its_own(tmp_path):

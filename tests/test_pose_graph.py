@@ -102,7 +102,8 @@ def test_the_command_moves_every_scan_onto_the_last(tmp_path, monkeypatch, capsy
         points = cloud[part::3] @ pose[:3, :3].T + pose[:3, 3]
         write_ply(tmp_path / f"{name}.ply", points)
     monkeypatch.chdir(tmp_path)
-    assert main(["register", "a.ply", "b.ply", "c.ply", "-o", "moved", "--json", "moved/out.json"]) == 0
+    results = ["-o", "moved", "--json", "moved/out.json"]
+    assert main(["register", "a.ply", "b.ply", "c.ply", *results]) == 0
     printed = capsys.readouterr().out
     assert "a.ply" in printed
     assert "b.ply" in printed

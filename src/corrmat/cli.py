@@ -86,7 +86,10 @@ def train_weights() -> None:
         _run_command(words)
         options = parse(words)
         from corrmat.registration.shipping import ship
-        from corrmat.training import recipe, runs
+        from corrmat.training import hardware, recipe, runs
+
+        if not hardware.is_first_process():
+            return 0
 
         loaded = recipe.load(options.config, options.scale, options.overrides)
         shipped = recipe.load(_config_folder() / "weights.yaml", "laptop")

@@ -30,6 +30,7 @@ from corrmat.types import PairBatch
 VALIDATION_SHARE = 0.1
 # Data sets of which there are as many shapes as one likes.
 GENERATED = "shapes", "assemblies", "rooms"
+_START = {"epoch": 0, "batches": 0}  # position in the training data
 _HELD_OUT_STREAM = 3  # random stream that selects the held-out training shapes
 
 
@@ -160,7 +161,7 @@ class RegistrationDataModule(L.LightningDataModule):
         self.counts = {"train": train_shapes, "test": test_shapes}
         self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed
         self.new_shapes = new_shapes
-        self._resume_state = {"epoch": 0, "batches": 0}
+        self._resume_state = _START.copy()
         for key, value, least in (
             ("batch_size", batch_size, 1),
             ("num_workers", num_workers, 0),
@@ -176,6 +177,8 @@ class RegistrationDataModule(L.LightningDataModule):
 
     def setup(self, stage: str | None = None) -> None:
         """Open the clouds that a stage needs ("fit", "validate", "test"; None: all)."""
+        if stage == "fit":  # if a training is resumed, `load_state_dict` follows
+            self._resume_state = _START.copy()
         if stage in ("fit", "validate", None):
             self.clouds("train")
         if stage in ("test", "predict", None):
@@ -197,6 +200,10 @@ class RegistrationDataModule(L.LightningDataModule):
     def train_dataloader(self) -> DataLoader[PairBatch]:
         """Return fresh pairs of every training shape in a new order each epoch."""
         return self._loader("train", self.pairs, self._share())
+
+    def count_train_batches(self, processes: int = 1) -> int:
+        """Count the batches of an epoch that each of several processes has."""
+        return len(self._loader("train", self.pairs, (0, processes)))
 
     def val_dataloader(self) -> DataLoader[PairBatch]:
         """Return one frozen pair of each held-out training shape."""

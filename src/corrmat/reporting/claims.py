@@ -102,7 +102,7 @@ def verdict_of_ratio(ratio: Estimate, paper: float | None, baseline_learnt: bool
         return "not shown"
     if ratio.high < 1:
         return "contradicted"
-    if ratio.low <= 1:
+    if not ratio.low > 1:  # NaN if both arms have no error at all
         return "not shown"
     near = paper is not None and ratio.value >= NEAR_PAPER * paper
     return "confirmed" if near else "confirmed in direction"
@@ -166,7 +166,7 @@ def sooner(evidence: Evidence) -> Claim | None:
     at_once = needed == treatment.curve[0]["pairs_seen"]
     if needed >= taken:
         verdict = "not shown" if needed == taken else "contradicted"
-    if not evidence.left_identity(evidence.baseline):
+    if not (evidence.left_identity(evidence.baseline) and math.isfinite(goal)):
         verdict = "not shown"
     reached = "never" if math.isinf(needed) else f"after {needed:,.0f}"
     reached += ", its first validation" if at_once else ""

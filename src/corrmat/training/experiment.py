@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -171,6 +172,8 @@ def _check_test_pairs(recipe: Recipe, arms: Sequence[Arm]) -> str:
                 f"{arms[0].name} and {arm.name} would be tested on different pairs: their data may "
                 "differ in batch_size, train_shapes and stretch only"
             )
+    for share in recipe.sweep_outliers:
+        replace(first.pairs, outliers=share)  # which checks it
     digest = first.test_pairs_digest(bands(recipe.bands_deg))
     if recipe.test_pairs in (None, digest):
         return digest

@@ -97,6 +97,8 @@ def train(
         log.info(f"continuing from {resume_from}")
     try:
         trainer.fit(method, arm.datamodule, ckpt_path=resume_from, weights_only=True)
+    except BrokenPipeError:  # whoever read our output has gone
+        raise
     except (CorrmatError, OSError) as error:
         last = folder / "last.ckpt"
         kept = last if last.is_file() else "none yet"
@@ -160,6 +162,8 @@ def seconds_to_train(arm: Arm) -> float | None:
 def load_trained(arm: Arm, checkpoint: Path) -> Method:
     """Build an arm's method with the weights of a checkpoint.
 
+    Options that change no weight may differ from those of its training; they are logged.
+
     Raises:
         CorrmatError: the checkpoint is missing, unreadable, or of another network.
     """
@@ -167,11 +171,15 @@ def load_trained(arm: Arm, checkpoint: Path) -> Method:
     if not checkpoint.is_file():
         raise CorrmatError(f"no checkpoint {checkpoint}; train first (corrmat fit)")
     try:
-        state = torch.load(checkpoint, map_location="cpu", weights_only=True)["state_dict"]
-        method.load_state_dict(state)
+        content = torch.load(checkpoint, map_location="cpu", weights_only=True)
+        method.load_state_dict(content["state_dict"])
     except Exception as error:  # unpickling raises errors of every type
         reason = short_message(error)
         raise CorrmatError(f"{checkpoint} does not fit these settings: {reason}") from error
+    now = arm.settings.network.as_dict()
+    for name, value in content.get("hyper_parameters", {}).get("network", {}).items():
+        if name in now and now[name] != value:
+            log.warning(f"{checkpoint} was trained with --network.{name} {value}, not {now[name]}")
     return method
 
 

@@ -1,5 +1,6 @@
 """Preflight checks: what would fail late in a run fails before it starts."""
 
+import inspect
 import math
 from dataclasses import dataclass
 
@@ -13,6 +14,12 @@ from corrmat.methods import METHODS, Method
 from corrmat.training.hardware import count_devices, trainer_options
 from corrmat.training.recipe import ArmSettings
 from corrmat.types import Prediction
+
+# Options of the Trainer that cut the frozen test pairs, or that checkpoints cannot go on from.
+_UNSUPPORTED = (
+    "fast_dev_run", "overfit_batches", "limit_test_batches", "reload_dataloaders_every_n_epochs",
+    "min_steps", "min_epochs", "barebones",
+)  # fmt: skip
 
 
 @dataclass
@@ -74,7 +81,7 @@ def build_method(settings: ArmSettings) -> Method:
 def planned_steps(arm: Arm) -> int | None:
     """Count the optimizer's steps in an arm's training; None if it has no end that steps know."""
     trainer = arm.settings.trainer
-    batches, limit = len(arm.datamodule.train_dataloader()), trainer.limit_train_batches
+    batches, limit = _train_batches(arm), trainer.limit_train_batches
     if limit is not None:
         batches = min(batches, limit) if isinstance(limit, int) else int(batches * limit)
     ends = [] if trainer.max_steps == -1 else [trainer.max_steps]
@@ -83,17 +90,35 @@ def planned_steps(arm: Arm) -> int | None:
     return min(ends, default=None)
 
 
+def _train_batches(arm: Arm) -> int:
+    """Count the batches of an epoch in each process."""
+    return arm.datamodule.count_train_batches(_processes(arm))
+
+
+def _processes(arm: Arm) -> int:
+    trainer = arm.settings.trainer
+    return count_devices(trainer.devices) * trainer.num_nodes
+
+
 def _check_optimization(arm: Arm) -> None:
     """Reject optimizer settings that Lightning would only fail on after training has started."""
     trainer, optimizer = arm.settings.trainer, arm.settings.optimizer
+    for name in _UNSUPPORTED:
+        if getattr(trainer, name) != inspect.signature(L.Trainer).parameters[name].default:
+            raise CorrmatError(f"--trainer.{name} does not go with records; try --scale smoke")
     if trainer.accumulate_grad_batches < 1:
         raise CorrmatError(
             f"--trainer.accumulate_grad_batches {trainer.accumulate_grad_batches} is not positive"
         )
-    limits = "limit_train_batches", "limit_val_batches", "limit_test_batches"
-    for name in ("max_steps", "max_epochs", *limits, "val_check_interval"):
-        if getattr(trainer, name) == 0:
-            raise CorrmatError(f"--trainer.{name} 0 leaves nothing to do")
+    limited = {
+        "limit_train_batches": _train_batches(arm),
+        "limit_val_batches": len(arm.datamodule.val_dataloader()),
+    }
+    for name in ("max_steps", "max_epochs", *limited, "val_check_interval"):
+        value = getattr(trainer, name)
+        share = int(limited[name] * value) if name in limited and isinstance(value, float) else None
+        if 0 in (value, share):
+            raise CorrmatError(f"--trainer.{name} {value:g} leaves nothing to do")
     timed = trainer.max_time is not None and trainer.max_epochs is None
     endless = trainer.max_steps == -1 and (trainer.max_epochs == -1 or timed)
     if optimizer.schedule == "onecycle":
@@ -115,7 +140,7 @@ def _check_optimization(arm: Arm) -> None:
 def _check_validation(arm: Arm) -> None:
     """Reject validation that never comes, or that would save checkpoints within a step."""
     trainer, data = arm.settings.trainer, arm.datamodule
-    processes = count_devices(trainer.devices) * trainer.num_nodes
+    processes = _processes(arm)
     held_out = len(data.clouds("val"))
     if processes > held_out:
         raise CorrmatError(
@@ -123,8 +148,10 @@ def _check_validation(arm: Arm) -> None:
             "--trainer.devices, or raise --data.train_shapes"
         )
     accumulate, interval = trainer.accumulate_grad_batches, trainer.val_check_interval
-    batches = len(data.train_dataloader())
-    if trainer.check_val_every_n_epoch is not None and isinstance(interval, int | float):
+    if not isinstance(interval, int | float | None):
+        raise CorrmatError(f"--trainer.val_check_interval {interval} is not a number of batches")
+    batches = _train_batches(arm)
+    if trainer.check_val_every_n_epoch is not None and interval is not None:
         least = interval if isinstance(interval, int) else 1 / interval
         if least > batches:
             raise CorrmatError(

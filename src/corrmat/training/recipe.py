@@ -245,6 +245,16 @@ def _check_keys(merged: Settings, path: Path) -> None:
     for key in ("bands_deg", "sweep_outliers", "baselines", "controls"):
         if not isinstance(merged.get(key) or [], list):
             raise CorrmatError(f"{path}: {key} must be a list, e.g. {key}: [...]")
+    for key in ("bands_deg", "sweep_outliers"):
+        values = cast(list[object], merged.get(key) or [])
+        if not all(isinstance(value, int | float) for value in values):
+            raise CorrmatError(f"{path}: {key} must be a list of numbers, not {values}")
+    edges = cast(list[float], merged.get("bands_deg") or [])
+    if len(edges) == 1 or edges != sorted(set(edges)):
+        raise CorrmatError(f"{path}: bands_deg must be two or more rising numbers, not {edges}")
+    for key in ("paper", "test_pairs"):
+        if not isinstance(merged.get(key) or {}, dict):
+            raise CorrmatError(f"{path}: {key} must be a mapping, e.g. {key}: {{...}}")
 
 
 def _roles(
@@ -286,7 +296,7 @@ def _arm_settings(
         raise CorrmatError(f"{path}: unknown method {method!r}; methods: {', '.join(METHODS)}")
     settings = merge(common, arm_layer)
     trainer = overrides.get("trainer")
-    if isinstance(trainer, Mapping) and "max_epochs" in trainer:
+    if isinstance(trainer, Mapping) and trainer.get("max_epochs") is not None:
         # Whoever names a number of epochs means it: the recipe's steps no longer count.
         settings = merge(settings, {"trainer": {"max_steps": -1}})
     parser = ArgumentParser(prog="corrmat", exit_on_error=False)

@@ -62,10 +62,10 @@ def _that_count(settings: Settings) -> Settings:
 def set_aside(folder: Path, arm: Arm) -> None:
     """Make room for a run: keep one that a record was written of, or of other settings."""
     recorded = (folder / _RECORDED).exists()
-    if not (folder / _SETTINGS).is_file() or (_same_settings(folder, arm) and not recorded):
+    if not any(folder.glob("*.ckpt")) or (_same_settings(folder, arm) and not recorded):
         shutil.rmtree(folder, ignore_errors=True)
         return
-    kept = next(place for place in _places_to_keep(folder) if not _is_unfinished(place))
+    kept = next(place for place in _places_to_keep(folder) if _may_replace(folder, place))
     shutil.rmtree(kept, ignore_errors=True)
     folder.rename(kept)
     log.info(f"the earlier run is kept: {kept}")
@@ -78,9 +78,16 @@ def _places_to_keep(folder: Path) -> Iterator[Path]:
         yield folder.with_name(f"{folder.name}.previous{number}")
 
 
-def _is_unfinished(folder: Path) -> bool:
-    """Tell whether a folder has a run that was interrupted: it is not replaced by another."""
-    return folder.is_dir() and not (folder / _TRAINED).is_file()
+def _may_replace(folder: Path, kept: Path) -> bool:
+    """Tell whether a run may be put in the place of an earlier one that was set aside.
+
+    An unfinished run neither replaces one nor is replaced. One with a record is replaced by
+    another with a record only.
+    """
+    if not kept.exists():
+        return True
+    finished = (folder / _TRAINED).is_file() and (kept / _TRAINED).is_file()
+    return finished and ((folder / _RECORDED).exists() or not (kept / _RECORDED).exists())
 
 
 def start_run(folder: Path, arm: Arm) -> None:
