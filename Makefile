@@ -104,6 +104,7 @@ TORCH_WITHOUT_CUDA = [ "$$(uname)" = Linux ] && ! command -v nvidia-smi > /dev/n
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "corrmat needs Python 3.11 or newer; name one with PYTHON=...")'
 	$(PYTHON) -m venv --clear .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv==$(UV_VERSION)
+	@echo "installing PyTorch and the other packages: 1.5 GB, or 6 GB with CUDA; a minute or more"
 	@if $(TORCH_WITHOUT_CUDA); then \
 		awk '/^[a-z]/ {keep = !/^(cuda|nvidia|torch|triton)[-=]/} keep' requirements.lock; \
 	else cat requirements.lock; fi > .venv/requirements.lock

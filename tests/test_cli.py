@@ -4,6 +4,7 @@ import sys
 import pytest
 from conftest import ROOT
 
+import corrmat
 from corrmat.cli import main
 
 FIT = ["fit", "--config", str(ROOT / "configs" / "exp" / "1.1.yaml"), "--scale", "smoke"]
@@ -25,6 +26,12 @@ def test_a_script_of_reproduce_is_the_whole_experiment(tmp_path):
     assert process.stdout.count("step ") == 4  # a line a validation
     assert "Warning" not in process.stderr
     assert (tmp_path / "results" / "smoke" / "shapes" / "1.2" / "metrics.json").is_file()
+
+
+def test_the_version_is_told(capsys):
+    with pytest.raises(SystemExit):
+        main(["--version"])
+    assert capsys.readouterr().out.strip() == f"corrmat {corrmat.__version__}"
 
 
 def test_help_teaches_by_example():
@@ -119,6 +126,9 @@ def test_corrmat_alone_says_what_it_can_do(capsys):
         (["data", "modelnet40", "--root", "file/x"], "file"),
         (["register", "a.ply", "b.ply", "-o", "moved.xyz"], "written as PLY"),
         (["register", "a.ply", "b.ply", "--json", "."], "is a folder, not a file"),
+        (["register", ".", "b.ply"], "is a folder, not a file of points"),
+        (["compare", "icp", "--root", "x"], "shapes is made, not read from x"),
+        ([*FIT, "--data.root", "x"], "shapes is made, not read from x"),
     ],
 )
 def test_what_would_do_nothing_or_fail_late_is_said_at_once(

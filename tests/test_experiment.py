@@ -402,8 +402,8 @@ def test_nothing_is_deleted_or_trained_when_the_test_split_cannot_be_read(tmp_pa
          "never comes in epochs of 4 batches"),
         ("--trainer.precision 16-mixed", "cannot clip"),
     ):  # fmt: skip
+        changed = load("1.1", *words.split(), arms=["DCP"])
         with pytest.raises(CorrmatError, match=message):
-            changed = load("1.1", *words.split(), arms=["DCP"])
             experiment.run(changed, tmp_path / "results", tmp_path / "runs")
         assert best.stat().st_mtime_ns == before
     sweep = dataclasses.replace(loaded, sweep_outliers=(0.1, 1.5))
@@ -423,9 +423,12 @@ def test_the_run_of_a_record_is_kept_while_others_come_and_go(tmp_path):
     signal.signal(signal.SIGINT, signal.default_int_handler)
     train(loaded.arms["DCP"], folder)
     assert (folder.with_name("DCP.previous") / "best.ckpt").read_bytes() == recorded
-    train(other, folder)  # finished, without a record
+    for rate in ("2e-4", "3e-4"):  # finished, without a record: none replaces another
+        train(load("1.1", "--optimizer.lr", rate, arms=["DCP"]).arms["DCP"], folder)
     train(loaded.arms["DCP"], folder)
     assert (folder.with_name("DCP.previous") / "best.ckpt").read_bytes() == recorded
+    kept = [path.name for path in folder.parent.glob("DCP.previous*")]
+    assert sorted(kept) == [f"DCP.previous{number}" for number in ("", 2, 3, 4, 5)]
 
 
 def test_a_checkpoint_that_lies_there_by_itself_is_kept(tmp_path):

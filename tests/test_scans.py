@@ -215,6 +215,11 @@ def test_an_npz_with_two_clouds_is_ambiguous(tmp_path):
         read_scan(tmp_path / "two.npz")
 
 
+def test_an_npz_with_points_and_normals_has_points(tmp_path):
+    np.savez(tmp_path / "cloud.npz", normals=POINTS[::-1], points=POINTS)
+    assert (read_scan(tmp_path / "cloud.npz") == POINTS).all()
+
+
 def test_writing_into_no_folder_says_so(tmp_path):
     with pytest.raises(CorrmatError, match="no folder"):
         write_ply(tmp_path / "none" / "cloud.ply", POINTS)

@@ -243,6 +243,8 @@ def _compare(options: Namespace) -> int:
 
 def _register(options: Namespace) -> int:
     """Register one file, or several, onto another."""
+    from corrmat.files import ensure_writable
+
     several = len(options.source) > 1
     files = [options.json, options.html, options.gif, None if several else options.output]
     written = [path.resolve() for path in filter(None, files)]
@@ -253,6 +255,8 @@ def _register(options: Namespace) -> int:
         if not path.parent.is_dir() and path.parent != options.output:
             raise CorrmatError(f"no folder {path.parent} to write {path.name} into")
         _keep_scans(options, path)
+        if path.parent.is_dir() and (path.is_file() or not path.exists()):
+            ensure_writable(path.parent)
     return (_register_several if several else _register_pair)(options)
 
 
@@ -278,7 +282,8 @@ def _register_pair(options: Namespace) -> int:
     from corrmat.data.scans import read_scan, write_ply
     from corrmat.files import replace_bytes, replace_text
 
-    source, target = (read_scan(path, options.seed) for path in (*options.source, options.target))
+    names = str(options.source[0]), str(options.target)
+    source, target = (read_scan(name, options.seed) for name in names)
     from corrmat.registration.register import register, to_json, to_text
 
     registration = register(
@@ -288,14 +293,14 @@ def _register_pair(options: Namespace) -> int:
     if options.output is not None:
         rotation, translation = registration.transform[:3, :3], registration.transform[:3, 3]
         write_ply(options.output, source @ rotation.T + translation)
-        print(f"moved source: {options.output}")
+        print(f"moved source, its points alone: {options.output}")
     if options.json is not None:
-        replace_text(options.json, to_json(registration))
+        replace_text(options.json, to_json(registration, *names))
         print(f"result: {options.json}")
     if options.html is not None:
         from corrmat.registration.view import registration_page  # plotly takes a second to import
 
-        replace_text(options.html, registration_page(registration, source, target))
+        replace_text(options.html, registration_page(registration, source, target, names))
         print(f"page: {options.html}")
     if options.gif is not None:
         from corrmat.registration.animation import registration_gif  # matplotlib too

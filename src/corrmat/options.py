@@ -7,6 +7,7 @@ from typing import Literal
 
 from jsonargparse import ArgumentParser, Namespace
 
+from corrmat import __version__
 from corrmat.errors import CorrmatError, short_message
 
 SHORT_HELP = """corrmat: Correspondence Matrices are Underrated (3DV 2020), reproduced.
@@ -155,6 +156,7 @@ def build_parser(with_settings: Sequence[str] = ()) -> ArgumentParser:
     raw = argparse.RawDescriptionHelpFormatter
     parser = ArgumentParser(
         prog="corrmat",
+        version=__version__,
         description="Correspondence Matrices are Underrated (3DV 2020), reproduced.",
         epilog=EPILOG,
         formatter_class=raw,

@@ -22,14 +22,12 @@ from corrmat.data.pairs import (
     generator,
     make_pairs,
 )
-from corrmat.data.registry import DATASETS, load_clouds
+from corrmat.data.registry import DATASETS, GENERATED, load_clouds
 from corrmat.data.shapes.dataset import sample_shape
 from corrmat.errors import CorrmatError
 from corrmat.types import PairBatch
 
 VALIDATION_SHARE = 0.1
-# Data sets of which there are as many shapes as one likes.
-GENERATED = "shapes", "assemblies", "rooms"
 _START = {"epoch": 0, "batches": 0}  # position in the training data
 _HELD_OUT_STREAM = 3  # random stream that selects the held-out training shapes
 
@@ -132,8 +130,8 @@ class RegistrationDataModule(L.LightningDataModule):
             takes a fraction of a millisecond; with new shapes or views, tens.
         seed: of the pairs and of the held-out shapes.
         new_shapes: train on new shapes in every epoch, of the categories of the training shapes:
-            only for data sets of `GENERATED`. No training shape of the data set is then trained
-            on, whatever the seed; those held out are the ones of seed 0.
+            only for data sets of `registry.GENERATED`. No training shape of the data set is then
+            trained on, whatever the seed; those held out are the ones of seed 0.
         pair_settings: fields of `PairSettings`, e.g. num_points=512, keep=0.7.
 
     Raises:

@@ -19,6 +19,8 @@ DATASETS: dict[str, Loader] = {
     "folder": folder.load,
 }
 
+GENERATED = "shapes", "assemblies", "rooms"  # the others are read from a folder
+
 
 def load_clouds(
     name: str, split: str, count: int | None = None, root: Path | None = None
@@ -33,6 +35,8 @@ def load_clouds(
     for each in names:
         if each not in DATASETS:
             raise CorrmatError(f"unknown data set {each!r}; data sets: {', '.join(DATASETS)}")
+    if root is not None and set(names) <= set(GENERATED):
+        raise CorrmatError(f"{name} is made, not read from {root}: is folder or modelnet40 meant?")
     if len(names) == 1:
         return DATASETS[name](split, count, root)
     share = None if count is None else -(-count // len(names))

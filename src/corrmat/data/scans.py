@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     import trimesh
 
 MESHES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
-CLOUDS = (".pcd", ".xyz", ".txt", ".csv", ".npy", ".npz")
+CLOUDS = (".pcd", ".xyz", ".txt", ".csv", ".asc", ".pts", ".npy", ".npz")
 SAMPLES = 20_000  # points taken of a mesh's surface
+_POINTS = ("points", "xyz", "pos")  # usual names of an array of points beside others
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+").fullmatch
 _FACES = re.compile(rb"^element (face|tristrips) +[1-9]", re.MULTILINE)
 
@@ -29,7 +30,7 @@ def read_scan(path: str | Path, seed: int = 0) -> np.ndarray:
     See `read_shape`.
 
     Args:
-        path: PLY, OBJ, STL, OFF, GLB or GLTF; PCD, XYZ, TXT, CSV, NPY or NPZ.
+        path: PLY, OBJ, STL, OFF, GLB or GLTF; PCD, XYZ, TXT, CSV, ASC, PTS, NPY or NPZ.
         seed: of the sampling of a mesh.
 
     Raises:
@@ -53,6 +54,8 @@ def read_shape(path: Path) -> "np.ndarray | trimesh.Trimesh":
         CorrmatError: see `read_scan`.
     """
     kind = path.suffix.lower()
+    if path.is_dir():
+        raise CorrmatError(f"{path} is a folder, not a file of points")
     if kind not in MESHES + CLOUDS:
         formats = ", ".join(name[1:] for name in MESHES + CLOUDS)
         raise CorrmatError(
@@ -147,12 +150,13 @@ def _pcd(path: Path) -> np.ndarray:
 
 
 def _numpy(path: Path) -> np.ndarray:
-    """Read the array of an NPY file, or the only array of points of an NPZ file."""
+    """Read the array of an NPY file, or that of an NPZ file which holds the points."""
     content = np.load(path, allow_pickle=False)
     if isinstance(content, np.ndarray):
         return content
     with content:
         names = [n for n in content.files if content[n].ndim == 2 and content[n].shape[1] >= 3]
+        names = [name for name in names if name in _POINTS] or names
         if len(names) != 1:
             raise CorrmatError(
                 f"{path} holds {len(names)} arrays of points (N, 3), not one: {content.files}"

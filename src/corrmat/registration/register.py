@@ -397,7 +397,7 @@ def to_text(registration: Registration) -> str:
         f"rotation     {registration.rotation_deg:.3f} deg",
         f"translation  {x:.6g} {y:.6g} {z:.6g}",
         f"overlap      {registration.overlap:.1%} of the source has a target point near",
-        f"RMSE         {registration.rmse:.6g} of those",
+        f"RMSE         {registration.rmse:.6g} of those" if registration.overlap else "",
     ]
     if len(registration.matches):
         agree, matches = registration.match_agrees.sum(), len(registration.matches)
@@ -408,9 +408,8 @@ def to_text(registration: Registration) -> str:
         f"confidence   {registration.confidence:.0%}{note}",
         f"verdict      {registration.verdict}",
     ]
-    return "\n".join(
-        [*lines, f"({registration.model}, seed {registration.seed}, {registration.seconds:.2f} s)"]
-    )
+    lines.append(f"({registration.model}, seed {registration.seed}, {registration.seconds:.2f} s)")
+    return "\n".join(filter(None, lines))
 
 
 def matrix_lines(transform: np.ndarray) -> list[str]:
@@ -418,13 +417,15 @@ def matrix_lines(transform: np.ndarray) -> list[str]:
     return ["  ".join(f"{value: .12g}".rjust(20) for value in row) for row in transform]
 
 
-def to_json(registration: Registration) -> str:
-    """Format a registration for programs."""
+def to_json(registration: Registration, source: str, target: str) -> str:
+    """Format a registration, of these files, for programs."""
     names = ("confidence", "rmse", "overlap", "verdict", "model", "seed", "seconds")
     values = {name: getattr(registration, name) for name in names}
     if not np.isfinite(registration.rmse):
         values["rmse"] = None
-    return json.dumps({"transform": registration.transform.tolist(), **values}, indent=1) + "\n"
+    files = {"source": source, "target": target}
+    content = {**files, "transform": registration.transform.tolist(), **values}
+    return json.dumps(content, indent=1) + "\n"
 
 
 def to_original_units(

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import plotly.graph_objects as go
 
-from corrmat.registration.register import Registration
+from corrmat.registration.register import Registration, matrix_lines
 from corrmat.registration.scene import build_scene, extent
 from corrmat.reporting.figures import BLUE, GREEN, GREY, RED
 from corrmat.reporting.html import render
@@ -15,17 +15,23 @@ MAX_POINTS = 4000  # drawn of a cloud
 MAX_LINES = 150  # strongest matches drawn
 
 
-def registration_page(registration: Registration, source: np.ndarray, target: np.ndarray) -> str:
+def registration_page(
+    registration: Registration,
+    source: np.ndarray,
+    target: np.ndarray,
+    names: tuple[str, str] = ("source", "target"),
+) -> str:
     """Build the HTML of a registration.
 
     Args:
         registration: of the source onto the target.
         source: (N, 3 or more), as given to `register`.
         target: (M, 3 or more).
+        names: of source and target, for the legend and the title.
     """
     scene = build_scene(registration, source, target, MAX_LINES)
     fixed, aligned, (i, j) = scene.fixed, scene.aligned, scene.matches.T
-    figure = go.Figure([_points(fixed, "target", BLUE), _points(aligned, "source", RED)])
+    figure = go.Figure([_points(fixed, names[1], BLUE), _points(aligned, names[0], RED)])
     for name, chosen, colour in (
         ("matches that agree", scene.agrees, GREEN),
         ("other matches", ~scene.agrees, GREY),
@@ -51,6 +57,8 @@ def registration_page(registration: Registration, source: np.ndarray, target: np
     return render(
         "registration.html.j2",
         registration=registration,
+        names=names,
+        matrix="\n".join(matrix_lines(registration.transform)),
         motion=json.dumps(motion),
         plot=figure.to_html(
             include_plotlyjs=True,

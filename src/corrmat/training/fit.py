@@ -170,17 +170,28 @@ def load_trained(arm: Arm, checkpoint: Path) -> Method:
     method = build_method(arm.settings)
     if not checkpoint.is_file():
         raise CorrmatError(f"no checkpoint {checkpoint}; train first (corrmat fit)")
+    others = ""
     try:
         content = torch.load(checkpoint, map_location="cpu", weights_only=True)
+        others = _other_options(arm, content.get("hyper_parameters", {}).get("network", {}))
         method.load_state_dict(content["state_dict"])
     except Exception as error:  # unpickling raises errors of every type
-        reason = short_message(error)
+        reason = others or short_message(error)
         raise CorrmatError(f"{checkpoint} does not fit these settings: {reason}") from error
-    now = arm.settings.network.as_dict()
-    for name, value in content.get("hyper_parameters", {}).get("network", {}).items():
-        if name in now and now[name] != value:
-            log.warning(f"{checkpoint} was trained with --network.{name} {value}, not {now[name]}")
+    if others:
+        log.warning(f"{checkpoint}: {others}")
     return method
+
+
+def _other_options(arm: Arm, trained: Mapping[str, object]) -> str:
+    """Say which options of the network a checkpoint was trained with that an arm has not."""
+    now = arm.settings.network.as_dict()
+    others = [
+        f"--network.{name} {value}, not {now[name]}"
+        for name, value in trained.items()
+        if name in now and now[name] != value
+    ]
+    return f"it was trained with {'; '.join(others)}" if others else ""
 
 
 def score(

@@ -81,13 +81,16 @@ def _places_to_keep(folder: Path) -> Iterator[Path]:
 def _may_replace(folder: Path, kept: Path) -> bool:
     """Tell whether a run may be put in the place of an earlier one that was set aside.
 
-    An unfinished run neither replaces one nor is replaced. One with a record is replaced by
-    another with a record only.
+    Both must be finished, of the same settings, and the new one have a record if the old one has.
     """
     if not kept.exists():
         return True
-    finished = (folder / _TRAINED).is_file() and (kept / _TRAINED).is_file()
-    return finished and ((folder / _RECORDED).exists() or not (kept / _RECORDED).exists())
+    if not all(
+        (each / _TRAINED).is_file() and (each / _SETTINGS).is_file() for each in (folder, kept)
+    ):
+        return False
+    same = (folder / _SETTINGS).read_text() == (kept / _SETTINGS).read_text()
+    return same and ((folder / _RECORDED).exists() or not (kept / _RECORDED).exists())
 
 
 def start_run(folder: Path, arm: Arm) -> None:
