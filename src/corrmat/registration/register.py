@@ -35,8 +35,8 @@ WITHOUT_MATCHABILITIES = 1.5, 0.0, 0.0  # for models that have none: no unmatche
 CANDIDATE_STEPS = 5  # of generalised ICP, for each candidate; EM-ICP with matches does the rest
 STEPS_WITHOUT_MATCHES = 30  # the same for models that have none
 SAME_TRANSFORM = 0.1  # difference of two matrices: a turn by 4 degrees, or a shift by 0.1
-COARSE_POINTS = 400  # of either cloud, for EM-ICP's first iterations
-FINE_ITERATIONS = 4  # of EM-ICP, the last, on all points of the model
+COARSE_POINTS = 400  # of either cloud, for EM-ICP's first pass
+FINE_ITERATIONS = 4  # of its second pass, on all points of a model with matches
 MEDIAN = 0.6  # median distance from the centroid after scaling: a radius of about one
 NORMAL_TOLERANCE = 0.01  # by which the length of a given normal may differ from one
 FAR = 30.0  # median distances from the middle: a point beyond is a stray one and left out
@@ -235,9 +235,9 @@ def refine_chosen(
     subsamples: tuple[np.ndarray, np.ndarray],
     full: AlignmentScorer,
 ) -> np.ndarray:
-    """Refine the chosen transform (4, 4) by EM-ICP on the model's points.
+    """Refine the chosen transform (4, 4) by EM-ICP, on a few points and then on all of the model's.
 
-    With matches, a few points are enough for the first iterations. Generalised ICP follows where
+    With matches, the last iterations are enough for the second pass. Generalised ICP follows where
     it is more exact: on points that the model has not seen, and on points that both clouds share.
 
     Args:
@@ -246,12 +246,13 @@ def refine_chosen(
         subsamples: the clouds that they were made from.
         full: scorer of the clouds, with all their points.
     """
-    prob, widths = hypotheses.prob, WIDTHS
-    if prob is not None:
-        coarse, widths = np.split(WIDTHS, [-FINE_ITERATIONS])
-        source, target = (cloud[:COARSE_POINTS] for cloud in subsamples)
-        transform = em_icp(transform, source, target, prob[: len(source), : len(target)], coarse)
-    transform = em_icp(transform, *subsamples, prob, widths)
+    source, target = (cloud[:COARSE_POINTS] for cloud in subsamples)
+    prob = hypotheses.prob
+    some = None if prob is None else prob[: len(source), : len(target)]
+    transform = em_icp(transform, source, target, some)
+    if max(map(len, subsamples)) > COARSE_POINTS:
+        widths = WIDTHS if prob is None else WIDTHS[-FINE_ITERATIONS:]
+        transform = em_icp(transform, *subsamples, prob, widths)
     more = max(len(full.source), len(full.target)) > MODEL_POINTS
     return full.refine(transform) if more or full.shares_points(transform) else transform
 
