@@ -20,6 +20,8 @@ import matplotlib as mpl
 import torch
 from matplotlib import pyplot as plt
 
+from corrmat.files import replace_text
+
 PLACE = bench.ROOT / "results" / "bench"
 # The first kind one of whose words is in the operator's name.
 KINDS = {
@@ -123,7 +125,7 @@ def main() -> None:
             continue
         measured[label][name] = bench.in_a_process(dissect, *step)
         print(name, measured[label][name], flush=True)
-    path.write_text(json.dumps(measured, indent=1) + "\n")
+    replace_text(path, json.dumps(measured, indent=1) + "\n")
     draw(measured)
     print(f"written: {path.relative_to(bench.ROOT)}, anatomy.png")
 

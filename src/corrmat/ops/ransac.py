@@ -7,6 +7,8 @@ from torch import Tensor
 
 from corrmat.ops import rigid
 
+_DRAWS = 20_000  # triples
+_FITS = 1000  # transforms at most, to the triples that may be rigid
 _REFITS = 5  # weighted fits of a transform to the matches that it explains
 _SAME_ROTATION = math.cos(math.radians(10))  # closer rotations count as one hypothesis
 
@@ -19,8 +21,6 @@ def fit_triples(
     inlier_threshold: float,
     *,
     generator: torch.Generator,
-    draws: int = 20000,
-    fits: int = 1000,
 ) -> tuple[Tensor, Tensor]:
     """Fit rigid transforms to random triples of matches, all as one batch.
 
@@ -34,8 +34,6 @@ def fit_triples(
         weight: (K,) weight of each match; also its probability of being drawn.
         inlier_threshold: largest residual of a match, in units of the points.
         generator: random generator of the draws.
-        draws: triples drawn.
-        fits: transforms fitted to the triples that are left.
 
     Returns:
         Rotations (F, 3, 3) and translations (F, 3), in the order of the draws; F = 0 if no triple
@@ -44,11 +42,13 @@ def fit_triples(
     x, y, weight = x.double(), y.double(), weight.double()
     if not (weight > 0).any():
         return x.new_empty(0, 3, 3), x.new_empty(0, 3)
-    triple = torch.multinomial(weight, 3 * draws, replacement=True, generator=generator).view(-1, 3)
+    triple = torch.multinomial(weight, 3 * _DRAWS, replacement=True, generator=generator).view(
+        -1, 3
+    )
     sides_x, sides_y = _side_lengths(x[triple]), _side_lengths(y[triple])
     rigid_enough = (sides_x - sides_y).abs().amax(1) < inlier_threshold
     wide_enough = sides_x.amin(1) > 2 * inlier_threshold
-    triple = triple[rigid_enough & wide_enough][:fits]
+    triple = triple[rigid_enough & wide_enough][:_FITS]
     if not len(triple):
         return x.new_empty(0, 3, 3), x.new_empty(0, 3)
     return rigid.procrustes(x[triple], y[triple])

@@ -38,13 +38,6 @@ def compose(outer: tuple[Tensor, Tensor], inner: tuple[Tensor, Tensor]) -> tuple
     return composed, apply(rotation, translation, inner[1].unsqueeze(-2)).squeeze(-2)
 
 
-def invert(rotation: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
-    """Invert a transform ((..., 3, 3), (..., 3))."""
-    inverse = rotation.mT
-    with torch.autocast(rotation.device.type, enabled=False):
-        return inverse, -(inverse @ translation.unsqueeze(-1)).squeeze(-1)
-
-
 def to_homogeneous(rotation: ArrayLike | Tensor, translation: ArrayLike | Tensor) -> np.ndarray:
     """Build the (..., 4, 4) float64 matrices of transforms ((..., 3, 3), (..., 3)) on a CPU."""
     rotation, translation = (  # NumPy knows no bfloat16

@@ -18,7 +18,7 @@ from corrmat.data.room_pairs import make_room_pair
 from corrmat.errors import CorrmatError
 from corrmat.files import replace_text
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG, rotation_error_deg
-from corrmat.registration.register import Refine, register
+from corrmat.registration.register import register
 from corrmat.revision import commit
 from corrmat.types import PairBatch
 
@@ -119,23 +119,20 @@ def _room_pairs(points: int, count: int, split: Split) -> PairBatch:
     return PairBatch(source, target, rotation, translation, none, source[:, :2048], index)
 
 
-def compare(
-    pairs: PairBatch, models: Sequence[str], refine: Refine = "icp"
-) -> dict[str, ModelResult]:
+def compare(pairs: PairBatch, models: Sequence[str]) -> dict[str, ModelResult]:
     """Register every pair with every model.
 
     Args:
         pairs: from `frozen_pairs`; the models get their normals.
         models: as `register` takes them.
-        refine: the same for all.
     """
     for model in models:  # a model that cannot be loaded fails before the others have worked
-        _register_pair(pairs, 0, model, refine)
+        _register_pair(pairs, 0, model)
     return {
         model: summarise(
             pairs,
             [
-                _register_pair(pairs, index, model, refine)
+                _register_pair(pairs, index, model)
                 for index in track(range(len(pairs)), model, transient=True)
             ],
         )
@@ -186,10 +183,10 @@ def to_table(results: Mapping[str, ModelResult]) -> str:
     return "\n".join(lines)
 
 
-def _register_pair(pairs: PairBatch, index: int, model: str, refine: Refine) -> Outcome:
+def _register_pair(pairs: PairBatch, index: int, model: str) -> Outcome:
     """Register one pair."""
     source, target = (c[index].double().numpy() for c in (pairs.source, pairs.target))
-    result = register(source, target, model=model, refine=refine)
+    result = register(source, target, model=model)
     angle, adds = errors(pairs, index, result.transform)
     return Outcome(angle, adds, 1e3 * result.seconds, result.agreement, result.support)
 

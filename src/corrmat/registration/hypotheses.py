@@ -238,12 +238,10 @@ def kiss(
     return Hypotheses(kiss_matcher(source, target, settings)[None], *_NO_MATCHES)
 
 
-def ransac17(
-    source: np.ndarray, target: np.ndarray, seed: int, settings: FpfhSettings = FPFH_RANSAC
-) -> Hypotheses:
+def ransac17(source: np.ndarray, target: np.ndarray, seed: int) -> Hypotheses:
     """Return seventeen hypotheses of RANSAC: one from each of as many seeds."""
     seeds = range(17 * seed, 17 * (seed + 1))
-    return Hypotheses(fpfh_ransac(source, target, seeds, settings), *_NO_MATCHES)
+    return Hypotheses(fpfh_ransac(source, target, seeds), *_NO_MATCHES)
 
 
 CLASSICAL: dict[str, HypothesisGenerator] = {

@@ -69,7 +69,7 @@ def staleness(record: Record, repository: Path) -> str:
     return f"changed since: {', '.join(sorted(changed))}" if changed else ""
 
 
-def code_of(family: str, arms: Iterable[str], package: Path = PACKAGE) -> list[str]:
+def code_of(family: str, arms: Iterable[str]) -> list[str]:
     """List the files that a family's numbers depend on, from the import graph of the package.
 
     Other families' networks do not count.
@@ -77,7 +77,6 @@ def code_of(family: str, arms: Iterable[str], package: Path = PACKAGE) -> list[s
     Args:
         family: of the record; the start of its methods' names.
         arms: names of arms, which may be methods.
-        package: folder of the package.
 
     Returns:
         Paths like "corrmat/ops/rigid.py".
@@ -87,15 +86,15 @@ def code_of(family: str, arms: Iterable[str], package: Path = PACKAGE) -> list[s
     pending, reached = {*_ROOTS, *networks}, set[str]()
     while pending:
         module = pending.pop()
-        path = _path(module, package)
+        path = _path(module)
         if module in reached or path is None or module.startswith(_BOUNDARY):
             continue
         reached.add(module)
         for name in _imports(path):
             skip_networks = name.startswith(_NETWORKS) and not module.startswith(_NETWORKS)
             pending |= set() if skip_networks else {name}
-    paths = (_path(module, package) for module in reached)
-    return sorted(p.relative_to(package.parent).as_posix() for p in paths if p is not None)
+    paths = (_path(module) for module in reached)
+    return sorted(p.relative_to(PACKAGE.parent).as_posix() for p in paths if p is not None)
 
 
 @functools.cache
@@ -110,9 +109,9 @@ def _imports(path: Path) -> frozenset[str]:
     return frozenset(names)
 
 
-def _path(module: str, package: Path) -> Path | None:
+def _path(module: str) -> Path | None:
     """Return the file of a module; None for a name that is not a module."""
-    path = package.parent.joinpath(*module.split(".")).with_suffix(".py")
+    path = PACKAGE.parent.joinpath(*module.split(".")).with_suffix(".py")
     return path if path.is_file() else None
 
 
