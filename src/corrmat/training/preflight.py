@@ -97,7 +97,7 @@ def _train_batches(arm: Arm) -> int:
 
 def _processes(arm: Arm) -> int:
     trainer = arm.settings.trainer
-    return count_devices(trainer.devices) * trainer.num_nodes
+    return max(1, count_devices(trainer.devices)) * trainer.num_nodes  # 0: Lightning counts them
 
 
 def _check_optimization(arm: Arm) -> None:
