@@ -245,19 +245,42 @@ def _register(options: Namespace) -> int:
     """Register one file, or several, onto another."""
     from corrmat.files import ensure_writable
 
-    several = len(options.source) > 1
-    files = [options.json, options.html, options.gif, None if several else options.output]
-    written = [path.resolve() for path in filter(None, files)]
-    for path in filter(None, files):
+    files = [*filter(None, (options.json, options.html, options.gif)), *_moved_files(options)]
+    written = [path.resolve() for path in files]
+    for path in files:
         if written.count(path.resolve()) > 1:
             raise CorrmatError(f"{path} is named for two results, and one would be lost")
         _refuse_folder(path)
         if not path.parent.is_dir() and path.parent != options.output:
             raise CorrmatError(f"no folder {path.parent} to write {path.name} into")
-        _keep_scans(options, path)
-        if path.parent.is_dir() and (path.is_file() or not path.exists()):
+        for scan in (*options.source, options.target):
+            if scan.resolve() == path.resolve():
+                raise CorrmatError(f"{path} is one of the scans, and would be overwritten")
+        if path.is_file() or not path.exists():  # not a pipe
             ensure_writable(path.parent)
-    return (_register_several if several else _register_pair)(options)
+    return (_register_several if len(options.source) > 1 else _register_pair)(options)
+
+
+def _moved_files(options: Namespace) -> list[Path]:
+    """List the PLY files of the moved scans: --output, or one for each scan in that folder.
+
+    Raises:
+        CorrmatError: --output does not go with the scans.
+    """
+    output, scans = options.output, options.source
+    if output is None:
+        return []
+    is_ply = output.suffix.lower() == ".ply"
+    if len(scans) == 1:
+        if not is_ply:
+            raise CorrmatError(f"the moved source is written as PLY, {output} has another suffix")
+        return [output]
+    if is_ply or output.is_file():
+        raise CorrmatError(f"{output}: with several scans, --output is a folder")
+    names = [path.with_suffix(".ply").name for path in scans]
+    if len(set(names)) < len(names):
+        raise CorrmatError(f"two scans would both be written to {output}: rename one")
+    return [output / name for name in names]
 
 
 def _refuse_folder(path: Path) -> None:
@@ -266,19 +289,8 @@ def _refuse_folder(path: Path) -> None:
         raise CorrmatError(f"{path} is a folder, not a file to write")
 
 
-def _keep_scans(options: Namespace, written: Path) -> None:
-    """Refuse to overwrite one of the scans."""
-    for scan in (*options.source, options.target):
-        if scan.resolve() == written.resolve():
-            raise CorrmatError(f"{written} is one of the scans, and would be overwritten")
-
-
 def _register_pair(options: Namespace) -> int:
     """Register one file onto another."""
-    if options.output is not None and options.output.suffix.lower() != ".ply":
-        raise CorrmatError(
-            f"the moved source is written as PLY, {options.output} has another suffix"
-        )
     from corrmat.data.scans import read_scan, write_ply
     from corrmat.files import replace_bytes, replace_text
 
@@ -314,20 +326,8 @@ def _register_several(options: Namespace) -> int:
     """Register several files onto one."""
     if options.html or options.gif:
         raise CorrmatError("--html and --gif show two scans; --output moves several, to look at")
-    from corrmat.files import ensure_writable, replace_text
-
-    names = [path.with_suffix(".ply").name for path in options.source]
-    if options.output is not None:
-        if options.output.suffix.lower() == ".ply" or options.output.is_file():
-            raise CorrmatError(f"{options.output}: with several scans, --output is a folder")
-        if len(set(names)) < len(names):
-            raise CorrmatError(f"two scans would both be written to {options.output}: rename one")
-        for moved in (options.output / name for name in names):
-            _keep_scans(options, moved)
-            if options.json is not None and options.json.resolve() == moved.resolve():
-                raise CorrmatError(f"{moved} is named for two results, and one would be lost")
-        ensure_writable(options.output)
     from corrmat.data.scans import read_scan, write_ply
+    from corrmat.files import replace_text
 
     scans = [read_scan(path, options.seed) for path in (*options.source, options.target)]
     from corrmat.registration import pose_graph
@@ -338,9 +338,8 @@ def _register_several(options: Namespace) -> int:
     print(pose_graph.to_text(options.source, options.target, poses))
     if options.output is not None:
         options.output.mkdir(parents=True, exist_ok=True)
-        for name, scan, pose in zip(names, scans, poses, strict=False):
-            moved = scan @ pose.transform[:3, :3].T + pose.transform[:3, 3]
-            write_ply(options.output / name, moved)
+        for path, scan, pose in zip(_moved_files(options), scans, poses, strict=False):
+            write_ply(path, scan @ pose.transform[:3, :3].T + pose.transform[:3, 3])
         print(f"moved scans: {options.output}")
     if options.json is not None:
         replace_text(options.json, pose_graph.to_json(options.source, options.target, poses))

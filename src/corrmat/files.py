@@ -2,6 +2,7 @@
 
 import os
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 
 from corrmat.errors import CorrmatError
@@ -30,6 +31,17 @@ def replace_bytes(path: Path, content: bytes | memoryview) -> None:
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def refuse_existing(paths: Iterable[Path]) -> None:
+    """Refuse to overwrite files that somebody else may have written.
+
+    Raises:
+        CorrmatError: one of them exists.
+    """
+    for path in paths:
+        if path.exists():
+            raise CorrmatError(f"{path} is there already; choose another folder")
 
 
 def ensure_writable(folder: Path) -> None:

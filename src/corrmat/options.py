@@ -89,7 +89,8 @@ REGISTER_EPILOG = """examples:
       the classical pipeline instead (pip install -e '.[baselines]' in corrmat's folder)
 
 Files: PLY, OBJ, STL, OFF, GLB, GLTF (meshes are sampled, scenes merged), PCD, XYZ, TXT, CSV,
-NPY, NPZ. Both files must have the same unit, whichever it is. Parts may be missing from either.
+ASC, PTS, NPY, NPZ. Both files must have the same unit, whichever it is. Parts may be missing
+from either.
 
 verdict: "aligned" from a confidence of 90 % on, "probably aligned" from 50 %, else "doubtful".
 exit codes: 0 done, whatever the verdict; 2 a file cannot be used, and one line says why."""

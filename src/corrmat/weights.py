@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from corrmat.errors import CorrmatError
-from corrmat.files import replace_bytes
+from corrmat.files import refuse_existing, replace_bytes
 from corrmat.networks.dcp import DCPNetwork
 from corrmat.networks.invariant import InvariantNetwork
 from corrmat.networks.pcrnet import PCRNetCorrNetwork, PCRNetwork
@@ -173,9 +173,7 @@ def export_model(model: str | Path, folder: str | Path) -> None:
         "README.md": card.encode(),
     }
     if not (folder / _MODEL_FILE).exists():  # it is not an earlier export
-        for path in map(folder.joinpath, files):
-            if path.exists():
-                raise CorrmatError(f"{path} is there already; choose another folder")
+        refuse_existing(map(folder.joinpath, files))
     folder.mkdir(parents=True, exist_ok=True)
     for name, written in files.items():
         replace_bytes(folder / name, written)

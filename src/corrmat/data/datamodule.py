@@ -22,7 +22,7 @@ from corrmat.data.pairs import (
     generator,
     make_pairs,
 )
-from corrmat.data.registry import DATASETS, GENERATED, load_clouds
+from corrmat.data.registry import DATASETS, is_generated, load_clouds
 from corrmat.data.shapes.dataset import sample_shape
 from corrmat.errors import CorrmatError
 from corrmat.types import PairBatch
@@ -130,7 +130,7 @@ class RegistrationDataModule(L.LightningDataModule):
             takes a fraction of a millisecond; with new shapes or views, tens.
         seed: of the pairs and of the held-out shapes.
         new_shapes: train on new shapes in every epoch, of the categories of the training shapes:
-            only for data sets of `registry.GENERATED`. No training shape of the data set is then
+            only for data sets that `is_generated`. No training shape of the data set is then
             trained on, whatever the seed; those held out are the ones of seed 0.
         pair_settings: fields of `PairSettings`, e.g. num_points=512, keep=0.7.
 
@@ -169,7 +169,7 @@ class RegistrationDataModule(L.LightningDataModule):
         ):
             if value is not None and value < least:
                 raise CorrmatError(f"{key} = {value} is out of range")
-        if new_shapes and not set(data.split("+")) <= set(GENERATED):
+        if new_shapes and not is_generated(data):
             raise CorrmatError(f"new_shapes: shapes of {data} cannot be made")
         self._clouds: dict[str, CloudSet] = {}
 

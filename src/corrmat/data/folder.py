@@ -71,9 +71,8 @@ def load(split: str, count: int | None = None, root: Path | None = None) -> Clou
     identity = [
         (f.relative, Path(f.path).stat().st_size, Path(f.path).stat().st_mtime_ns) for f in files
     ]
-    digest = hashlib.sha256(os.fsencode(repr((root.resolve().as_posix(), identity)))).hexdigest()[
-        :12
-    ]
+    content = os.fsencode(repr((root.resolve().as_posix(), identity)))
+    digest = hashlib.sha256(content).hexdigest()[:12]
     shards = cache_folder() / f"folder-{root.name}-{digest}-{split}"
     clouds = open_shards(shards)
     if clouds is None:

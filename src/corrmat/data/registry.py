@@ -19,7 +19,12 @@ DATASETS: dict[str, Loader] = {
     "folder": folder.load,
 }
 
-GENERATED = "shapes", "assemblies", "rooms"  # the others are read from a folder
+_GENERATED = {"shapes", "assemblies", "rooms"}  # the others are read from a folder
+
+
+def is_generated(name: str) -> bool:
+    """Tell whether a data set, or several joined by "+", is made rather than read."""
+    return set(name.split("+")) <= _GENERATED
 
 
 def load_clouds(
@@ -35,7 +40,7 @@ def load_clouds(
     for each in names:
         if each not in DATASETS:
             raise CorrmatError(f"unknown data set {each!r}; data sets: {', '.join(DATASETS)}")
-    if root is not None and set(names) <= set(GENERATED):
+    if root is not None and is_generated(name):
         raise CorrmatError(f"{name} is made, not read from {root}: is folder or modelnet40 meant?")
     if len(names) == 1:
         return DATASETS[name](split, count, root)

@@ -134,11 +134,16 @@ def _ply(path: Path) -> "np.ndarray | trimesh.Trimesh":
     """Return the vertices of a PLY file without faces; read one with faces as a mesh."""
     from plyfile import PlyData
 
-    header, end, body = path.read_bytes().partition(b"end_header")
-    if _FACES.search(header):
-        return _scene(path)
-    header = header.decode("ascii", "replace").encode("ascii", "replace")  # comments of any kind
-    vertices = PlyData.read(io.BytesIO(header + end + body))["vertex"]
+    with path.open("rb") as file:
+        header = b""
+        for line in file:
+            header += line
+            if line.startswith(b"end_header"):
+                break
+        if _FACES.search(header):
+            return _scene(path)
+        header = header.decode("ascii", "replace").encode("ascii", "replace")  # comments
+        vertices = PlyData.read(io.BytesIO(header + file.read()))["vertex"]
     return np.stack([np.asarray(vertices[axis], np.float64) for axis in "xyz"], 1)
 
 
@@ -174,11 +179,13 @@ def _text(path: Path) -> np.ndarray:
         for line in path.read_text("utf-8-sig", "replace").splitlines()
         if line.strip() and not line.lstrip().startswith("#")
     ]
-    last = re.split(r"[;\s]+", lines[-1].strip()) if lines else []
+    if not lines:
+        return np.empty((0, 3))
+    last = re.split(r"[;\s]+", lines[-1].strip())
     if len(last) > 1 and all(map(_DECIMAL_COMMA, last)):
         raise CorrmatError(f"{path}: numbers like 1,5 need a decimal point")
-    separator = next((mark for mark in ";," if lines and mark in lines[-1]), None)
-    if lines and lines[0].strip().isdigit():  # the number of points, in XYZ files
+    separator = next((mark for mark in ";," if mark in lines[-1]), None)
+    if lines[0].strip().isdigit():  # the number of points, in XYZ files
         del lines[0]
     columns = [0, 1, 2]
     first = _cells(lines[0].lstrip("/ "), separator) if lines else []

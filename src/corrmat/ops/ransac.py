@@ -42,9 +42,8 @@ def fit_triples(
     x, y, weight = x.double(), y.double(), weight.double()
     if not (weight > 0).any():
         return x.new_empty(0, 3, 3), x.new_empty(0, 3)
-    triple = torch.multinomial(weight, 3 * _DRAWS, replacement=True, generator=generator).view(
-        -1, 3
-    )
+    drawn = torch.multinomial(weight, 3 * _DRAWS, replacement=True, generator=generator)
+    triple = drawn.view(-1, 3)
     sides_x, sides_y = _side_lengths(x[triple]), _side_lengths(y[triple])
     rigid_enough = (sides_x - sides_y).abs().amax(1) < inlier_threshold
     wide_enough = sides_x.amin(1) > 2 * inlier_threshold

@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from corrmat.registration.register import Registration, is_near
+from corrmat.registration.register import Registration
 from corrmat.registration.scene import build_scene, extent
-from corrmat.reporting.figures import BLUE, GREEN, GREY, RED, principal_axes
+from corrmat.reporting.figures import BLUE, GREEN, GREY, RED
 from corrmat.reporting.snapshots import thin
 
 MAX_POINTS = 900  # drawn of a cloud
@@ -44,8 +44,7 @@ def _frames(
     registration: Registration, source: np.ndarray, target: np.ndarray
 ) -> Iterator[Image.Image]:
     """Draw frame by frame, seen so that the target is as wide as it can be."""
-    axes_of_view = principal_axes(target[is_near(target[:, :3]), :3])
-    scene = build_scene(registration, source, target, MAX_LINES, axes_of_view)
+    scene = build_scene(registration, source, target, MAX_LINES, widest=True)
     fixed, (i, j) = scene.fixed, scene.matches.T
     count = BEFORE + MATCHES + MOVING + AFTER
     figure = Figure(SIZE_INCHES, DPI)

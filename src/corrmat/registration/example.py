@@ -9,7 +9,7 @@ import torch
 from corrmat.data.scans import write_ply
 from corrmat.data.shapes.dataset import make_shape
 from corrmat.errors import CorrmatError
-from corrmat.files import replace_text
+from corrmat.files import refuse_existing, replace_text
 from corrmat.ops import rigid
 
 SHAPE = 25  # of the test split: a piano
@@ -32,9 +32,7 @@ def write_example(folder: Path) -> None:
     except OSError as error:
         raise CorrmatError(f"cannot create the folder {folder}: {error.strerror}") from error
     if not (folder / "truth.json").exists():  # it is not an earlier example
-        for name in ("source.ply", "target.ply"):
-            if (folder / name).exists():
-                raise CorrmatError(f"{folder / name} is there already; choose another folder")
+        refuse_existing((folder / "source.ply", folder / "target.ply"))
     rng = np.random.default_rng(0)
     points = MILLIMETRES * make_shape(("test", SHAPE))[0][:, :3].astype(np.float64)
     order = rng.permutation(len(points))

@@ -308,7 +308,7 @@ class Cloud:
         if len(rows) < 3:
             many = f"{len(rows)} different points" if len(rows) > 1 else "all points are equal"
             raise CorrmatError(f"{name}: {many}; the rotation is not determined")
-        rows = rows[is_near(values[rows, :3], name)]
+        rows = rows[is_near(values[rows, :3], values[rows, :3], name)]
         if len(rows) < 3:
             raise CorrmatError(f"{name}: {len(rows)} points are left without the stray ones")
         checked = cls(rows, values[rows])
@@ -333,13 +333,17 @@ class Cloud:
         return np.hstack([points, given if given.shape[1] else estimate_normals(points)])
 
 
-def is_near(points: np.ndarray, name: str = "cloud") -> np.ndarray:
-    """Tell which points (N, 3) are no stray ones: (N,) bool. Copies of a point count once.
+def is_near(points: np.ndarray, different: np.ndarray, name: str = "cloud") -> np.ndarray:
+    """Tell which points are no stray ones: (N,) bool.
+
+    Args:
+        points: (N, 3).
+        different: (M, 3) the same, each once: copies would move the middle.
+        name: of the cloud, for the error.
 
     Raises:
         CorrmatError: coordinates are too large to be squared.
     """
-    different = np.unique(points, axis=0)
     middle = np.median(different, axis=0)
     with np.errstate(over="ignore"):
         distance = np.linalg.norm(points - middle, axis=1)

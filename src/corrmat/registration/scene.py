@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from corrmat.registration.register import Registration, is_near
+from corrmat.reporting.figures import principal_axes
 
 BESIDE = 0.6  # of both clouds' largest extents: how far the source starts from the target
 
@@ -42,12 +43,18 @@ def _largest_extent(points: np.ndarray) -> float:
     return float((high - low).max())
 
 
+def _hide_stray_points(points: np.ndarray) -> np.ndarray:
+    """Make stray points NaN: (N, 3) to (N, 3)."""
+    return np.where(is_near(points, np.unique(points, axis=0))[:, None], points, np.nan)
+
+
 def build_scene(
     registration: Registration,
     source: np.ndarray,
     target: np.ndarray,
     max_matches: int,
-    axes: np.ndarray | None = None,
+    *,
+    widest: bool = False,
 ) -> Scene:
     """Build the scene of a registration.
 
@@ -56,12 +63,11 @@ def build_scene(
         source: (N, 3 or more), as given to `register`.
         target: (M, 3 or more).
         max_matches: the most confident ones that are kept.
-        axes: (3, 3), the columns are axes of the scene; those of the target's frame if None.
+        widest: rotate the scene so that the target is as wide as it can be; else its axes are
+            those of the target's frame.
     """
-    axes = np.eye(3) if axes is None else axes
-    source, target = (
-        np.where(is_near(cloud[:, :3])[:, None], cloud[:, :3], np.nan) for cloud in (source, target)
-    )
+    source, target = (_hide_stray_points(cloud[:, :3]) for cloud in (source, target))
+    axes = principal_axes(target[np.isfinite(target).all(1)]) if widest else np.eye(3)
     origin = np.nanmean(target, 0)
     rotation, translation = registration.transform[:3, :3], registration.transform[:3, 3]
     fixed = (target - origin) @ axes

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import yaml
 
-from corrmat.data.registry import DATASETS
+from corrmat.data.registry import DATASETS, is_generated
 from corrmat.methods import METHODS
 from corrmat.reporting.record import Record
 from corrmat.revision import PACKAGE, git
@@ -25,10 +25,13 @@ def command(record: Record) -> str:
         return f"corrmat run --config ... --scale {record.scale}"
     target = record.id if record.id == "outliers" else f"exp{record.id}"
     scale = "" if record.scale == "laptop" else f" SCALE={record.scale}"
-    data = f" DATA={record.data}" if record.data != "shapes" else ""
-    if record.data == "modelnet40":
-        data += " ROOT=..."
-    elif not set(record.data.split("+")) <= set(DATASETS):
+    if record.data == "shapes":
+        data = ""
+    elif is_generated(record.data):
+        data = f" DATA={record.data}"
+    elif record.data in DATASETS:
+        data = f" DATA={record.data} ROOT=..."
+    else:  # named after the folder, or by NAME
         data = f" DATA=folder ROOT=... NAME={record.data}"
     seed = "" if record.seed == 0 else f' ARGS="--seed {record.seed}"'
     return f"make {target}{scale}{data}{seed}"

@@ -81,9 +81,7 @@ def build_method(settings: ArmSettings) -> Method:
 def planned_steps(arm: Arm) -> int | None:
     """Count the optimizer's steps in an arm's training; None if it has no end that steps know."""
     trainer = arm.settings.trainer
-    batches, limit = _train_batches(arm), trainer.limit_train_batches
-    if limit is not None:
-        batches = min(batches, limit) if isinstance(limit, int) else int(batches * limit)
+    batches = _limited(_train_batches(arm), trainer.limit_train_batches)
     ends = [] if trainer.max_steps == -1 else [trainer.max_steps]
     if trainer.max_epochs not in (None, -1):
         ends.append(trainer.max_epochs * math.ceil(batches / trainer.accumulate_grad_batches))
@@ -93,6 +91,13 @@ def planned_steps(arm: Arm) -> int | None:
 def _train_batches(arm: Arm) -> int:
     """Count the batches of an epoch in each process."""
     return arm.datamodule.count_train_batches(_processes(arm))
+
+
+def _limited(batches: int, limit: float | None) -> int:
+    """Count the batches that a limit of the Trainer leaves: a number, or a share if no integer."""
+    if limit is None:
+        return batches
+    return min(batches, limit) if isinstance(limit, int) else int(batches * limit)
 
 
 def _processes(arm: Arm) -> int:
@@ -110,15 +115,18 @@ def _check_optimization(arm: Arm) -> None:
         raise CorrmatError(
             f"--trainer.accumulate_grad_batches {trainer.accumulate_grad_batches} is not positive"
         )
-    limited = {
-        "limit_train_batches": _train_batches(arm),
-        "limit_val_batches": len(arm.datamodule.val_dataloader()),
+    left = {
+        "max_steps": trainer.max_steps,
+        "max_epochs": trainer.max_epochs,
+        "val_check_interval": trainer.val_check_interval,
+        "limit_train_batches": _limited(_train_batches(arm), trainer.limit_train_batches),
+        "limit_val_batches": _limited(
+            len(arm.datamodule.val_dataloader()), trainer.limit_val_batches
+        ),
     }
-    for name in ("max_steps", "max_epochs", *limited, "val_check_interval"):
-        value = getattr(trainer, name)
-        share = int(limited[name] * value) if name in limited and isinstance(value, float) else None
-        if 0 in (value, share):
-            raise CorrmatError(f"--trainer.{name} {value:g} leaves nothing to do")
+    for name, count in left.items():
+        if count == 0:
+            raise CorrmatError(f"--trainer.{name} {getattr(trainer, name):g} leaves nothing to do")
     timed = trainer.max_time is not None and trainer.max_epochs is None
     endless = trainer.max_steps == -1 and (trainer.max_epochs == -1 or timed)
     if optimizer.schedule == "onecycle":

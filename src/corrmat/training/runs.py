@@ -85,9 +85,7 @@ def _may_replace(folder: Path, kept: Path) -> bool:
     """
     if not kept.exists():
         return True
-    if not all(
-        (each / _TRAINED).is_file() and (each / _SETTINGS).is_file() for each in (folder, kept)
-    ):
+    if not all((each / _TRAINED).is_file() for each in (folder, kept)):
         return False
     same = (folder / _SETTINGS).read_text() == (kept / _SETTINGS).read_text()
     return same and ((folder / _RECORDED).exists() or not (kept / _RECORDED).exists())
