@@ -69,11 +69,11 @@ def dissect(method: str, hparams: dict[str, Any], n: int, batch: int) -> dict[st
     for _ in range(2):  # the first profile allocates
         with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
             run()
-    own: Counter[str] = Counter()
+    self_time: Counter[str] = Counter()
     for event in profile.key_averages():
-        own[kind_of(event.key)] += event.self_cpu_time_total
-    scale = 1e3 * seconds / batch / own.total()
-    return {kind: round(scale * time, 3) for kind, time in own.items()}
+        self_time[kind_of(event.key)] += event.self_cpu_time_total
+    scale = 1e3 * seconds / batch / self_time.total()
+    return {kind: round(scale * time, 3) for kind, time in self_time.items()}
 
 
 def draw(measured: dict[str, dict[str, dict[str, float]]]) -> None:

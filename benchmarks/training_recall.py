@@ -36,7 +36,7 @@ def git(*words: str) -> bytes:
 
 def extract_weights(folder: Path) -> dict[int, Path]:
     """Write the newest weights of each number of training pairs into a folder."""
-    found: dict[int, Path] = {}
+    weights: dict[int, Path] = {}
     commits = git("log", "--format=%H", "--", WEIGHTS).decode().split()
     committed = (git("show", f"{commit}:{WEIGHTS}") for commit in commits)
     for number, content in enumerate(itertools.chain([(ROOT / WEIGHTS).read_bytes()], committed)):
@@ -46,8 +46,8 @@ def extract_weights(folder: Path) -> dict[int, Path]:
             pairs = (file.metadata() or {}).get("pairs")
         if pairs is None:
             break  # older weights do not say
-        found.setdefault(int(pairs), path)
-    return found
+        weights.setdefault(int(pairs), path)
+    return weights
 
 
 def main() -> None:

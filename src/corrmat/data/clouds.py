@@ -134,9 +134,9 @@ class CloudSet:
 
     def checksum(self) -> str:
         """Compute a CRC of labels and of up to 256 shapes: which data a network was trained on."""
-        spread = np.linspace(0, len(self) - 1, min(256, len(self))).round().astype(int)
+        sample = np.linspace(0, len(self) - 1, min(256, len(self))).round().astype(int)
         crc = zlib.crc32(np.ascontiguousarray(self.labels).data)
-        return f"{zlib.crc32(np.ascontiguousarray(self.rows[spread]).data, crc):08x}"
+        return f"{zlib.crc32(np.ascontiguousarray(self.rows[sample]).data, crc):08x}"
 
 
 def cache_folder() -> Path:

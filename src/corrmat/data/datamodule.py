@@ -68,8 +68,8 @@ class PairDataset(Dataset[PairBatch]):
             sample_shape(self.clouds.names[label], generator(key, Purpose.SHAPE))
             for label, key in zip(labels, keys, strict=True)
         ]
-        made = CloudSet(np.stack(rows), labels, self.clouds.names)
-        return make_pairs(made, range(len(rows)), keys, self.settings)
+        clouds = CloudSet(np.stack(rows), labels, self.clouds.names)
+        return make_pairs(clouds, range(len(rows)), keys, self.settings)
 
 
 class EpochSampler(Sampler[tuple[int, int]]):

@@ -85,12 +85,12 @@ def within_radius(points: Tensor, radius: float, k: int) -> Tensor:
         (B, N, k) int64, ascending; unused places hold the point's own index.
     """
     batch, n, _ = points.shape
-    own = torch.arange(n, device=points.device).unsqueeze(1)
+    rows = torch.arange(n, device=points.device).unsqueeze(1)
     wanted = torch.arange(1, k + 1, dtype=torch.int32, device=points.device)
     parts = []
-    for part in own.split(max(1, _CHUNK // max(1, batch * n))):
+    for part in rows.split(max(1, _CHUNK // max(1, batch * n))):
         near = torch.cdist(points[:, part[:, 0]], points, compute_mode=_EXACT) <= radius
-        near &= part != own.mT
+        near &= part != rows.mT
         rank = near.cumsum(-1, dtype=torch.int32)  # how many neighbours have this index or less
         index = torch.searchsorted(rank, wanted.expand(batch, len(part), -1).contiguous())
         parts.append(torch.where(index < n, index, part))

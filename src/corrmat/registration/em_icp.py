@@ -114,5 +114,5 @@ def _gauss_newton(points: Tensor, force: Tensor, stiffness: Tensor) -> tuple[Ten
     vector = torch.cat([torch.linalg.cross(points, force).sum(0), force.sum(0)])
     # Without any match there is nothing to balance, and no step.
     matrix = matrix.double() + 1e-6 * torch.eye(6, dtype=torch.float64)
-    turn, shift = -torch.linalg.solve(matrix, vector.double()).float().view(2, 3)
-    return rigid.axis_angle_to_matrix(F.normalize(turn, dim=0), turn.norm()), shift
+    rotvec, shift = -torch.linalg.solve(matrix, vector.double()).float().view(2, 3)
+    return rigid.axis_angle_to_matrix(F.normalize(rotvec, dim=0), rotvec.norm()), shift

@@ -155,11 +155,11 @@ class NetworkHypotheses:
         least = int(getattr(self.network, "min_points", 3))
         if min(x.shape[1], y.shape[1]) < least:
             raise CorrmatError(f"this network needs clouds of at least {least} points")
-        own = next(self.network.parameters(), x)  # where and in which precision it computes
+        parameter = next(self.network.parameters(), x)  # where and in which precision it computes
         modes = [(module, module.training) for module in self.network.modules()]
         self.network.eval()
         try:
-            prediction = self.network(x.to(own), y.to(own))
+            prediction = self.network(x.to(parameter), y.to(parameter))
         finally:
             for module, mode in modes:
                 module.training = mode

@@ -116,8 +116,8 @@ def held_out_pairs(
     # The shapes that runs held out until each pair got a new one.
     clouds = RegistrationDataModule(data="shapes+assemblies").clouds("val")
     families = np.flatnonzero([clouds.names[label] != "assembly" for label in clouds.labels])
-    spread = np.linspace(0, len(families) - 1, min(count, len(families))).round().astype(int)
-    chosen = families[spread].tolist()
+    evenly = np.linspace(0, len(families) - 1, min(count, len(families))).round().astype(int)
+    chosen = families[evenly].tolist()
     keys = [Key(seed, STREAM["val"], 0, shape) for shape in chosen]
     settings = replace(benchmark.PROTOCOLS[protocol], num_points=points)
     return make_pairs(clouds, chosen, keys, settings)

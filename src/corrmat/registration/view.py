@@ -49,9 +49,9 @@ def registration_page(
         legend={"orientation": "h", "y": 0, "font": {"color": "#808080"}},
         scene={**axes, "aspectmode": "data", "camera": {"eye": {"x": 0.3, "y": -1.4, "z": 0.7}}},
     )
-    motion = {
+    path = {
         "middle": np.nanmean(aligned, 0).tolist(),
-        "turn": scene.rotvec.tolist(),
+        "rotvec": scene.rotvec.tolist(),
         "beside": scene.beside,
     }
     return render(
@@ -59,7 +59,7 @@ def registration_page(
         registration=registration,
         names=names,
         matrix="\n".join(matrix_lines(registration.transform)),
-        motion=json.dumps(motion),
+        path=json.dumps(path),
         plot=figure.to_html(
             include_plotlyjs=True,
             full_html=False,

@@ -90,11 +90,11 @@ def families_table(results: Path) -> str:
         return np.concatenate([_within_angle(tested[name]) for name in names])
 
     unseen = hits("without first, first", "without second, second")
-    seen = hits("without second, first", "without first, second")
+    trained = hits("without second, first", "without first, second")
     shipped = hits("shipped, first", "shipped, second")
     rows = {
         "families that the small network has not seen": unseen,
-        "the same, small network that has seen them": seen,
+        "the same, small network that has seen them": trained,
         "the same, shipped network": shipped,
     }
     if "shipped, modelnet40" in tested:
@@ -102,10 +102,10 @@ def families_table(results: Path) -> str:
         rows["modelnet40, both small networks"] = other
         rows["modelnet40, shipped network"] = hits("shipped, modelnet40")
     lines = [markdown_row(["pairs", "count", "within 5 deg"]), "|---|---|---|"]
-    for what, found in rows.items():
-        recall = f"{found.mean():.1%} ({_wilson(found)})"
-        lines.append(markdown_row([what, str(len(found)), recall]))
-    p = f"p = {_mcnemar(seen, unseen):.2g} (exact McNemar test)"
+    for what, within in rows.items():
+        recall = f"{within.mean():.1%} ({_wilson(within)})"
+        lines.append(markdown_row([what, str(len(within)), recall]))
+    p = f"p = {_mcnemar(trained, unseen):.2g} (exact McNemar test)"
     return "\n".join([*lines, "", f"The first two rows differ with {p}."])
 
 

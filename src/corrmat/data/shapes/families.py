@@ -265,10 +265,10 @@ def door(rng: Rng) -> Parts:
     leaf.append(rod((0.8 * x, 0, 0), (0.8 * x, -0.15, 0), 0.03))
     leaf.append(rod((0.8 * x, -0.15, 0), (0.5 * x, -0.15, 0), 0.03))
     swing = np.deg2rad(ajar)
-    turn = np.eye(4)
-    turn[:2, :2] = [[np.cos(swing), np.sin(swing)], [-np.sin(swing), np.cos(swing)]]
+    rotation = np.eye(4)
+    rotation[:2, :2] = [[np.cos(swing), np.sin(swing)], [-np.sin(swing), np.cos(swing)]]
     for part in leaf:
-        part.apply_translation((x, 0, 0)).apply_transform(turn)
+        part.apply_translation((x, 0, 0)).apply_transform(rotation)
     frame = [box((0.08, 0.12, 2 * z), (at, 0, 0)) for at in (-0.04, 2 * x + 0.04)]
     return [*leaf, *frame, box((2 * x + 0.16, 0.12, 0.08), (x, 0, z))]
 
