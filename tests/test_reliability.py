@@ -81,6 +81,22 @@ def test_kill_9_and_the_same_command_end_as_if_nothing_had_been(tmp_path, whole,
     assert_same_end(folder, trained, whole)
 
 
+@pytest.mark.parametrize("step", [6, 8])  # in the middle of the second epoch, and at its end
+def test_a_run_of_epochs_whose_rate_falls_in_steps_resumes_as_well(step, tmp_path):
+    """As at scale paper."""
+    torch.set_num_threads(1)
+    options = {
+        "trainer.max_steps": -1, "trainer.max_epochs": 4, "trainer.check_val_every_n_epoch": 1,
+        "trainer.val_check_interval": 1.0, "data.train_shapes": 20,
+        "optimizer.schedule": "step", "optimizer.milestones": [1, 2],
+    }  # fmt: skip
+    words = [f"--{name}={value}" for name, value in options.items()]
+    settings = load("1.1", *words).arms["DCP_corr"]
+    whole = train(settings, tmp_path / "whole")
+    interrupted(tmp_path / "arm", settings, step)
+    assert_same_end(tmp_path / "arm", train(settings, tmp_path / "arm"), whole)
+
+
 @pytest.mark.slow
 def test_kill_9_at_any_moment(tmp_path, whole):
     """Killed again and again, a little later every time, until there is nothing left to do."""

@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 from corrmat import weights
 from corrmat.data.datamodule import RegistrationDataModule
 from corrmat.data.pairs import STREAM, Key, make_pairs
-from corrmat.files import replace_text
+from corrmat.files import ensure_writable, replace_text
 from corrmat.metrics import ADDS_THRESHOLD
 from corrmat.registration import benchmark
 from corrmat.revision import commit
@@ -34,6 +34,7 @@ def ship(checkpoint: Path, facts: Mapping[str, Any], results: Path) -> None:
         facts: of its run, see `training.runs.trained_facts`.
         results: folder of records.
     """
+    ensure_writable(results / "register")
     _, hparams, network = weights.checkpoint_network(checkpoint)
     calibration, recalls = calibrate(str(checkpoint))
     before = int(weights.shipped_metadata().get("pairs", 0))
