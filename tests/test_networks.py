@@ -1,3 +1,4 @@
+import copy
 import functools
 
 import pytest
@@ -75,6 +76,25 @@ def test_dgcnn_gives_the_same_with_and_without_the_fused_kernel(monkeypatch, gen
         results.append([features, *(p.grad.clone() for p in network.parameters())])
     for fused, plain in zip(*results, strict=True):
         torch.testing.assert_close(fused, plain, rtol=1e-8, atol=1e-9)
+
+
+def test_one_cloud_may_take_the_fused_kernel_and_the_other_not(monkeypatch, generator):
+    """A cropped source has fewer edges than its target."""
+    torch.manual_seed(0)
+    network = DGCNN(16, (8, 8, 12, 16), 5).double()
+    source, target = (
+        torch.randn(2, n, 3, dtype=torch.float64, generator=generator) for n in (20, 30)
+    )
+    start, results = copy.deepcopy(network.state_dict()), []
+    for fewest in (2 * 25 * 5, 10**9):
+        monkeypatch.setattr(edge_mlp, "_MIN_EDGES", fewest)
+        network.load_state_dict(start)
+        network.zero_grad()
+        (network(source).square().sum() + network(target).square().sum()).backward()
+        gradients = [p.grad.clone() for p in network.parameters()]
+        results.append([*gradients, *map(torch.clone, network.buffers())])
+    for mixed, plain in zip(*results, strict=True):
+        torch.testing.assert_close(mixed, plain, rtol=1e-8, atol=1e-9)
 
 
 @pytest.mark.parametrize("slab", [1, 700, 2**20])

@@ -79,7 +79,8 @@ def test_an_empty_cell_of_a_table_keeps_its_place(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "header", ["id,x,y,z", "label x y z", '"n","X","Y","Z"', "//N X Y Z", "// N X Y Z", "n;x;y;z"]
+    "header", ["id,x,y,z", "label x y z", '"n","X","Y","Z"', "//N X Y Z", "// N X Y Z", "n;x;y;z",
+               "# id x y z", "# id,x,y,z", "#n;x;y;z"]
 )
 def test_the_names_of_columns_say_which_are_the_coordinates(tmp_path, header):
     separator = next((mark for mark in ",;" if mark in header), " ")

@@ -20,6 +20,7 @@ MESHES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
 CLOUDS = (".pcd", ".xyz", ".txt", ".csv", ".asc", ".pts", ".npy", ".npz")
 SAMPLES = 20_000  # points taken of a mesh's surface
 _POINTS = ("points", "xyz", "pos")  # usual names of an array of points beside others
+_XYZ = {"x", "y", "z"}
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+").fullmatch
 _FACES = re.compile(rb"^element (face|tristrips) +[1-9]", re.MULTILINE)
 
@@ -172,32 +173,34 @@ def _numpy(path: Path) -> np.ndarray:
 def _text(path: Path) -> np.ndarray:
     """Read the columns x, y and z of a text file, by its header or else the first three.
 
-    Comments are skipped.
+    A header may be a comment, as np.savetxt writes it. Other comments are skipped.
     """
-    lines = [
-        line
-        for line in path.read_text("utf-8-sig", "replace").splitlines()
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
+    lines = [line.strip() for line in path.read_text("utf-8-sig", "replace").splitlines()]
+    comments = [line for line in lines if line.startswith("#")]
+    lines = [line for line in lines if line and not line.startswith("#")]
     if not lines:
         return np.empty((0, 3))
-    last = re.split(r"[;\s]+", lines[-1].strip())
+    last = re.split(r"[;\s]+", lines[-1])
     if len(last) > 1 and all(map(_DECIMAL_COMMA, last)):
         raise CorrmatError(f"{path}: numbers like 1,5 need a decimal point")
     separator = next((mark for mark in ";," if mark in lines[-1]), None)
-    if lines[0].strip().isdigit():  # the number of points, in XYZ files
+    if lines[0].isdigit():  # the number of points, in XYZ files
         del lines[0]
     columns = [0, 1, 2]
     first = _cells(lines[0].lstrip("/ "), separator) if lines else []
     if lines and not any(map(_is_number, first)):  # a header
         names = [word.strip("\"'").lower() for word in first]
-        if not {"x", "y", "z"} <= set(names):
+        if not _XYZ <= set(names):
             raise CorrmatError(
                 f"{path}: the header names {', '.join(names)}, but not x, y and z; rename them, or "
                 "delete the header if the first three columns are meant"
             )
         columns = [names.index(axis) for axis in "xyz"]
         del lines[0]
+    for comment in comments:
+        names = re.split(r"[;,\s]+", comment.lstrip("# ").lower())
+        if _XYZ <= set(names) and len(names) == len(first):
+            columns = [names.index(axis) for axis in "xyz"]
     if not lines:
         return np.empty((0, 3))
     try:

@@ -180,9 +180,11 @@ def _track(norm: nn.BatchNorm1d, statistics: Statistics, count: int) -> None:
     assert norm.num_batches_tracked is not None
     assert norm.momentum is not None
     norm.num_batches_tracked.add_(1)
-    norm.running_mean.lerp_(statistics.mean[0].to(norm.running_mean.dtype), norm.momentum)
     unbiased = statistics.variance[0] * (count / max(count - 1, 1))
-    norm.running_var.lerp_(unbiased.to(norm.running_var.dtype), norm.momentum)
+    # Unseen by autograd, as in torch's batch norm: the norm of another cloud may have saved them.
+    mean, variance = norm.running_mean.data, norm.running_var.data
+    mean.lerp_(statistics.mean[0].to(mean.dtype), norm.momentum)
+    variance.lerp_(unbiased.to(variance.dtype), norm.momentum)
 
 
 class _Layer(torch.autograd.Function):
