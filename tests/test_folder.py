@@ -57,19 +57,33 @@ def test_shapenets_layout_and_a_flat_folder_are_split_by_a_hash(tmp_path):
     flat = tmp_path / "flat"
     write_meshes(flat, [f"{i}.ply" for i in range(20)])
     for root, name in ((shapenet, "03001627"), (flat, "flat")):
-        train, test = (folder.find_shapes(root, split) for split in ("train", "test"))
-        assert train[0] == test[0] == (name,)
-        paths = [file.relative for _, files in (train, test) for file in files]
+        names, splits = folder.find_shapes(root)
+        assert names == (name,)
+        paths = [file.relative for files in splits.values() for file in files]
         assert sorted(set(paths)) == sorted(paths)
         assert len(paths) == 20
-        assert 0 < len(test[1]) < len(train[1])
+        assert 0 < len(splits["test"]) < len(splits["train"])
 
 
 def test_a_folder_called_train_may_hold_trains(tmp_path):
     write_meshes(tmp_path, [f"{c}/{i}.off" for c in ("bus", "car", "train") for i in range(20)])
-    train, test = (folder.find_shapes(tmp_path, split) for split in ("train", "test"))
-    assert train[0] == test[0] == ("bus", "car", "train")
-    assert len(train[1]) + len(test[1]) == 60
+    names, splits = folder.find_shapes(tmp_path)
+    assert names == ("bus", "car", "train")
+    assert len(splits["train"]) + len(splits["test"]) == 60
+
+
+@pytest.mark.parametrize("count", [2, 3, 5, 8])
+def test_a_handful_of_shapes_is_enough_for_both_splits(tmp_path, count):
+    for first in range(30):
+        paths = [Path(f"{first + i}.ply") for i in range(count)]
+        assert set(folder._split_by_hash(paths)) == {"train", "test"}
+
+
+def test_files_in_neither_split_are_left_out_with_a_word(tmp_path, caplog):
+    write_meshes(tmp_path, ["chair/train/a.off", "chair/test/b.off", "chair/val/c.off", "d.off"])
+    with caplog.at_level("WARNING", "corrmat"):
+        assert len(folder.load("train", root=tmp_path)) == 1
+    assert "2 files lie in no folder train or test, as chair/val/c.off: left out" in caplog.text
 
 
 def test_an_interrupted_build_continues_with_the_next_shard(modelnet, monkeypatch, tmp_path):
@@ -123,6 +137,6 @@ def test_a_file_name_need_not_be_utf8(tmp_path):
     name = os.fsdecode(b"box\xe9.npy")
     for path in (tmp_path / name, tmp_path / "b.npy"):
         np.save(path, np.random.default_rng(0).normal(size=(2048, 3)))
-    found = [file for split in ("train", "test") for file in folder.find_shapes(tmp_path, split)[1]]
+    found = sum(folder.find_shapes(tmp_path)[1].values(), [])
     assert sorted(Path(file.path).name for file in found) == ["b.npy", name]
     assert all(not isinstance(folder.sample_shape(file), str) for file in found)

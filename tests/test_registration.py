@@ -27,7 +27,7 @@ from corrmat.ops import rigid
 from corrmat.ops.correspondence import MatchabilityCorrespondence, SoftCorrespondence
 from corrmat.registration import example
 from corrmat.registration import register as registration
-from corrmat.registration.animation import registration_gif
+from corrmat.registration.animation import _title, registration_gif
 from corrmat.registration.hypotheses import (
     Hypotheses,
     NetworkHypotheses,
@@ -523,6 +523,25 @@ def test_a_doubtful_verdict_says_how_many_matches_agree_and_asks_for_one_unit(pa
     assert "unit" not in said
     for clouds in ((source, 1000 * target), (1000 * source, target)):
         assert "times as large as the other" in corrmat.register(*clouds).verdict
+
+
+def test_few_points_are_doubtful_however_well_they_lie():
+    triangles = np.random.default_rng(100).normal(size=(2, 3, 3))
+    result = corrmat.register(*triangles)
+    assert result.confidence < 0.5
+    assert result.verdict.startswith("doubtful: ")
+    assert "a cloud has only 3 points" in result.verdict
+
+
+def test_a_masked_array_is_refused(pair):
+    _, source, target, _ = pair
+    with pytest.raises(CorrmatError, match="a masked array"):
+        corrmat.register(np.ma.masked_array(source, source > 0.5), target)
+
+
+def test_the_last_title_of_an_animation_fits_into_it(pair):
+    result = corrmat.register(*np.random.default_rng(0).normal(size=(2, 200, 3)))
+    assert _title(result, 1.0, 0) == f"doubtful, confidence {result.confidence:.0%}"
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Files of anybody's clouds: every format gives the same points, a damaged file one clear line."""
 
 import io
+import os
 
 import numpy as np
 import pytest
@@ -79,8 +80,18 @@ def test_an_empty_cell_of_a_table_keeps_its_place(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "header", ["id,x,y,z", "label x y z", '"n","X","Y","Z"', "//N X Y Z", "// N X Y Z", "n;x;y;z",
-               "# id x y z", "# id,x,y,z", "#n;x;y;z"]
+    "header",
+    [
+        "id,x,y,z",
+        "label x y z",
+        '"n","X","Y","Z"',
+        "//N X Y Z",
+        "// N X Y Z",
+        "n;x;y;z",
+        "# id x y z",
+        "# id,x,y,z",
+        "#n;x;y;z",
+    ],
 )
 def test_the_names_of_columns_say_which_are_the_coordinates(tmp_path, header):
     separator = next((mark for mark in ",;" if mark in header), " ")
@@ -98,6 +109,21 @@ def test_an_array_that_lies_on_its_side_is_not_three_points(tmp_path):
 def test_three_points_with_normals_are_three_points(tmp_path):
     np.save(tmp_path / "three.npy", np.hstack([POINTS[:3], POINTS[:3]]))
     assert read_scan(tmp_path / "three.npy").tolist() == POINTS[:3].tolist()
+
+
+def test_an_organised_cloud_and_a_table_of_fields_are_points(tmp_path):
+    np.save(tmp_path / "organised.npy", POINTS[:20].reshape(4, 5, 3))
+    assert read_scan(tmp_path / "organised.npy").tolist() == POINTS[:20].tolist()
+    table = np.zeros(20, [("i", "u1"), ("z", "f8"), ("y", "f8"), ("x", "f8")])
+    table["x"], table["y"], table["z"] = POINTS[:20].T
+    np.save(tmp_path / "table.npy", table)
+    assert read_scan(tmp_path / "table.npy").tolist() == POINTS[:20].tolist()
+
+
+def test_a_pipe_is_not_a_missing_file(tmp_path):
+    os.mkfifo(tmp_path / "pipe.xyz")
+    with pytest.raises(CorrmatError, match="a pipe or device, not a file"):
+        read_scan(tmp_path / "pipe.xyz")
 
 
 @pytest.mark.parametrize("kind", [".ply", *CLOUDS])

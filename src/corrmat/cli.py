@@ -1,6 +1,7 @@
 """The command line and the scripts of reproduce/; options.py parses."""
 
 import os
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -231,7 +232,9 @@ def _compare(options: Namespace) -> int:
             raise CorrmatError("rooms are procedural: --data and --root go with other protocols")
         about["data"] = "procedural"
     pairs = benchmark.frozen_pairs(**about, root=options.root, count=options.pairs)
-    results = benchmark.compare(pairs, [name.strip() for name in options.models.split(",")])
+    results = benchmark.compare(
+        pairs, [name.strip() for name in options.models.split(",") if name.strip()]
+    )
     fewer = f", one of each shape: {options.pairs} were asked for"
     print(f"{len(pairs)} pairs{fewer if len(pairs) < options.pairs else ''}")
     print(benchmark.to_table(results))
@@ -362,10 +365,11 @@ def _example(options: Namespace) -> int:
 
     folder = options.folder
     write_example(folder)
+    names = (str(folder / name) for name in ("source.ply", "target.ply", "view.html"))
+    source, target, page = map(shlex.quote, names)
     print(
         f"{folder}: source.ply, target.ply and truth.json, two scans of one shape. Now try\n"
-        f"  corrmat register {folder / 'source.ply'} {folder / 'target.ply'} "
-        f"--html {folder / 'view.html'}"
+        f"  corrmat register {source} {target} --html {page}"
     )
     return 0
 

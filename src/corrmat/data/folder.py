@@ -2,8 +2,8 @@
 
 Three layouts are understood. In ModelNet40's, a folder `train` or `test` decides the split
 (`chair/train/chair_0001.off`). In ShapeNet's (`03001627/<id>/models/model.obj`) and in a folder of
-files, with or without a folder a category, a hash of the path puts one shape in five into the test
-split.
+files, with or without a folder a category, a hash of the path puts about one shape in five into the
+test split, and at least one.
 """
 
 import hashlib
@@ -51,22 +51,18 @@ def load(split: str, count: int | None = None, root: Path | None = None) -> Clou
         CorrmatError: the folder is missing, or holds no shape of this split.
     """
     if root is None:
-        raise CorrmatError("data set folder needs its folder: ROOT=... or --data.root ...")
+        raise CorrmatError(
+            "data set folder needs its folder: ROOT=..., --data.root ... or --root ..."
+        )
     if not root.is_dir():
         raise CorrmatError(f"no folder {root}")
-    names, files = find_shapes(root, split)
+    names, splits = find_shapes(root)
+    files = splits[split]
     if not files:
-        other = "test" if split == "train" else "train"
-        elsewhere = len(find_shapes(root, other)[1])
         raise CorrmatError(
-            f"{root} holds no shape for the {split} split"
-            + (
-                f": all {elsewhere} files fell to {other}, which without folders train/ and test/ "
-                "a hash of the path decides; add files, or sort them into those folders"
-                if elsewhere
-                else f"; shapes are {', '.join(SUFFIXES)} files, in any of the layouts of "
-                "README.md (Data)"
-            )
+            f"{root} holds {'one shape' if any(splits.values()) else 'no shape'}, and none for the "
+            f"{split} split; shapes are {', '.join(SUFFIXES)} files, in any of the layouts of "
+            "README.md (Data)"
         )
     identity = [
         (f.relative, Path(f.path).stat().st_size, Path(f.path).stat().st_mtime_ns) for f in files
@@ -76,6 +72,9 @@ def load(split: str, count: int | None = None, root: Path | None = None) -> Clou
     shards = cache_folder() / f"folder-{root.name}-{digest}-{split}"
     clouds = open_shards(shards)
     if clouds is None:
+        if splits["neither"]:
+            left_out, first = len(splits["neither"]), splits["neither"][0].relative
+            log.warning("%d files lie in no folder train or test, as %s: left out", left_out, first)
         build_shards(
             shards, names, files, sample_shape, f"sampling {len(files)} {split} shapes (once)"
         )
@@ -88,8 +87,12 @@ def load(split: str, count: int | None = None, root: Path | None = None) -> Clou
     return clouds.select(slice(count))
 
 
-def find_shapes(root: Path, split: str) -> tuple[tuple[str, ...], list[ShapeFile]]:
-    """Find the categories of a folder and the files of a split, in the order of their paths."""
+def find_shapes(root: Path) -> tuple[tuple[str, ...], dict[str, list[ShapeFile]]]:
+    """Find the categories of a folder and the files of both splits, in the order of their paths.
+
+    Returns:
+        Names of the categories; files of "train", "test" and "neither".
+    """
     paths = sorted(p for p in root.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
     relative = [path.relative_to(root) for path in paths]
     # Both must be there: a folder "train" alone is a category, of trains.
@@ -100,12 +103,11 @@ def find_shapes(root: Path, split: str) -> tuple[tuple[str, ...], list[ShapeFile
     if by_folder:  # `train/chair.off` has no category
         categories = [root.resolve().name if c in ("train", "test") else c for c in categories]
     names = tuple(sorted(set(categories)))
-    files = [
-        ShapeFile(str(path), rel.as_posix(), names.index(category))
-        for path, rel, category in zip(paths, relative, categories, strict=True)
-        if (_split_folder(rel) if by_folder else _split_by_hash(rel)) == split
-    ]
-    return names, files
+    chosen = [_split_folder(path) for path in relative] if by_folder else _split_by_hash(relative)
+    splits: dict[str, list[ShapeFile]] = {"train": [], "test": [], "neither": []}
+    for path, rel, category, split in zip(paths, relative, categories, chosen, strict=True):
+        splits[split].append(ShapeFile(str(path), rel.as_posix(), names.index(category)))
+    return names, splits
 
 
 def sample_shape(file: ShapeFile) -> tuple[np.ndarray, int] | str:
@@ -137,11 +139,15 @@ def sample_shape(file: ShapeFile) -> tuple[np.ndarray, int] | str:
     return rows.astype(np.float32), file.label
 
 
-def _split_folder(relative: Path) -> str | None:
-    """Return "train" or "test" if a folder of this name holds the file."""
-    return next((part for part in relative.parts[:-1] if part in ("train", "test")), None)
+def _split_folder(relative: Path) -> str:
+    """Return "train" or "test" if a folder of this name holds the file, else "neither"."""
+    folders = (part for part in relative.parts[:-1] if part in ("train", "test"))
+    return next(folders, "neither")
 
 
-def _split_by_hash(relative: Path) -> str:
-    digest = hashlib.sha256(os.fsencode(relative.as_posix())).digest()
-    return "test" if int.from_bytes(digest[:4], "big") < TEST_SHARE * 2**32 else "train"
+def _split_by_hash(relative: list[Path]) -> list[str]:
+    """Choose "train" or "test" for each path; of two or more, each gets at least one."""
+    digests = [hashlib.sha256(os.fsencode(path.as_posix())).digest()[:4] for path in relative]
+    shares = [int.from_bytes(digest, "big") / 2**32 for digest in digests]
+    border = max(TEST_SHARE, min(shares, default=0.0))
+    return ["test" if share <= border and share < max(shares) else "train" for share in shares]

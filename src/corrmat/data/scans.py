@@ -63,7 +63,10 @@ def read_shape(path: Path) -> "np.ndarray | trimesh.Trimesh":
             f"{path}: format {kind or 'without a suffix'} unknown; formats: {formats}"
         )
     if not path.is_file():
-        raise CorrmatError(f"{path}: no such file")
+        is_other = path.exists()
+        raise CorrmatError(
+            f"{path}: {'a pipe or device, not a file' if is_other else 'no such file'}"
+        )
     if not path.stat().st_size:
         raise CorrmatError(f"{path} is empty")
     reader = {".ply": _ply, ".pcd": _pcd, ".npy": _numpy, ".npz": _numpy}.get(kind)
@@ -72,6 +75,8 @@ def read_shape(path: Path) -> "np.ndarray | trimesh.Trimesh":
         points = reader(path)
         if not isinstance(points, np.ndarray):
             return points
+        if points.ndim == 3 and points.shape[2] == 3:  # an organised cloud, rows of pixels
+            points = points.reshape(-1, 3)
         if points.ndim != 2 or points.shape[1] < 3 or points.dtype.kind == "c":
             raise CorrmatError(
                 f"{path} holds an array of {points.dtype} of shape {points.shape}, not points "
@@ -159,7 +164,9 @@ def _numpy(path: Path) -> np.ndarray:
     """Read the array of an NPY file, or that of an NPZ file which holds the points."""
     content = np.load(path, allow_pickle=False)
     if isinstance(content, np.ndarray):
-        return content
+        fields = content.dtype.names or ()
+        is_table = _XYZ.issubset(fields)
+        return np.stack([content[axis].ravel() for axis in "xyz"], 1) if is_table else content
     with content:
         names = [n for n in content.files if content[n].ndim == 2 and content[n].shape[1] >= 3]
         names = [name for name in names if name in _POINTS] or names
@@ -190,7 +197,7 @@ def _text(path: Path) -> np.ndarray:
     first = _cells(lines[0].lstrip("/ "), separator) if lines else []
     if lines and not any(map(_is_number, first)):  # a header
         names = [word.strip("\"'").lower() for word in first]
-        if not _XYZ <= set(names):
+        if not _XYZ.issubset(names):
             raise CorrmatError(
                 f"{path}: the header names {', '.join(names)}, but not x, y and z; rename them, or "
                 "delete the header if the first three columns are meant"
@@ -199,7 +206,7 @@ def _text(path: Path) -> np.ndarray:
         del lines[0]
     for comment in comments:
         names = re.split(r"[;,\s]+", comment.lstrip("# ").lower())
-        if _XYZ <= set(names) and len(names) == len(first):
+        if _XYZ.issubset(names) and len(names) == len(first):
             columns = [names.index(axis) for axis in "xyz"]
     if not lines:
         return np.empty((0, 3))

@@ -45,7 +45,9 @@ def _frames(
 ) -> Iterator[Image.Image]:
     """Draw frame by frame, seen so that the target is as wide as it can be."""
     scene = build_scene(registration, source, target, MAX_LINES, widest=True)
-    fixed, (i, j) = scene.fixed, scene.matches.T
+    i, j = scene.matches.T
+    fixed, rows = thin(scene.fixed, MAX_POINTS), thin(np.arange(len(source)), MAX_POINTS)
+    drawn = np.concatenate([rows, i])  # of the source; the starts of the matches come last
     count = BEFORE + MATCHES + MOVING + AFTER
     figure = Figure(SIZE_INCHES, DPI)
     canvas = FigureCanvasAgg(figure)
@@ -53,7 +55,7 @@ def _frames(
     axes.set_axis_off()
     axes.set_aspect("equal")
     cameras = [_camera(TURN_DEG * (share - 0.5)).T for share in np.linspace(0, 1, count)]
-    corners = np.vstack([scene.source_at(0), fixed, scene.aligned])
+    corners = np.vstack([scene.source_at(0, drawn), fixed, scene.fixed[j], scene.aligned[drawn]])
     corners = np.vstack([corners @ camera for camera in cameras])
     (left_end, bottom), (right_end, top) = extent(corners)
     axes.set(xlim=(left_end, right_end), ylim=(bottom, top))
@@ -64,11 +66,13 @@ def _frames(
     title = figure.suptitle("", y=0.97, fontsize=13)
     for frame, camera in enumerate(cameras):
         share = float(np.clip((frame - BEFORE - MATCHES) / MOVING, 0, 1))
-        moved = scene.source_at(share**2 * (3 - 2 * share))  # starts and stops slowly
-        clouds[0].set_offsets(thin(fixed, MAX_POINTS) @ camera)
-        clouds[1].set_offsets(thin(moved, MAX_POINTS) @ camera)
+        moved = scene.source_at(share**2 * (3 - 2 * share), drawn)  # starts and stops slowly
+        clouds[0].set_offsets(fixed @ camera)
+        clouds[1].set_offsets(moved[: len(rows)] @ camera)
         shown = len(i) > 0 and BEFORE <= frame <= BEFORE + MATCHES
-        lines.set_segments(list(np.stack([moved[i], fixed[j]], 1) @ camera) if shown else [])
+        lines.set_segments(
+            list(np.stack([moved[len(rows) :], scene.fixed[j]], 1) @ camera) if shown else []
+        )
         title.set_text(_title(registration, share, len(i) if shown else 0))
         canvas.draw()
         yield Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
@@ -82,7 +86,8 @@ def _title(registration: Registration, share: float, lines: int) -> str:
         return "source (orange) and target (blue)"
     if share < 1:
         return f"rotated by {registration.rotation_deg:.0f}°"
-    return f"{registration.verdict}, confidence {registration.confidence:.0%}"
+    word, _, _ = registration.verdict.partition(":")  # the reason is too long for a title
+    return f"{word}, confidence {registration.confidence:.0%}"
 
 
 def _camera(azimuth_deg: float) -> np.ndarray:

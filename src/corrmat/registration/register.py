@@ -40,6 +40,8 @@ FINE_ITERATIONS = 4  # of its second pass, on all points of a model with matches
 MEDIAN = 0.6  # median distance from the centroid after scaling: a radius of about one
 NORMAL_TOLERANCE = 0.01  # by which the length of a given normal may differ from one
 FAR = 30.0  # median distances from the middle: a point beyond is a stray one and left out
+# Unrelated clouds of fewer points may lie on each other: they are "doubtful" at best.
+FEW_POINTS, FEW_CONFIDENCE = 30, 0.49
 OTHER_SIZE = 8.0  # times as large: two such clouds may have different units
 _LINE = 1e-6  # a cloud that is thinner, relative to its length, is a line
 
@@ -132,6 +134,9 @@ def register(
     support = hypotheses.support(transform, *subsamples)
     agrees = hypotheses.match_support(transform, *subsamples) > 0
     confidence = _calibration().confidence(agreement, support if len(agrees) else None)
+    fewest = min(len(x.rows), len(y.rows))
+    if fewest < FEW_POINTS:
+        confidence = min(confidence, FEW_CONFIDENCE)
     overlap, rmse = full.overlap_and_rmse(transform)
     rows = [cloud.rows[m] for cloud, m in zip((x, y), hypotheses.matches.T, strict=True)]
     return Registration(
@@ -144,23 +149,26 @@ def register(
         confidence=confidence,
         rmse=rmse / scale,
         overlap=overlap,
-        verdict=verdict(confidence, _reason(agrees, overlap, x.median / y.median)),
+        verdict=verdict(confidence, _reason(agrees, overlap, x.median / y.median, fewest)),
         model=str(model),
         seed=seed,
         seconds=time.perf_counter() - start,
     )
 
 
-def _reason(agrees: np.ndarray, overlap: float, size: float) -> str:
+def _reason(agrees: np.ndarray, overlap: float, size: float, fewest: int) -> str:
     """Say what a confidence that is not high rests on.
 
     Args:
         agrees: (K,) bool, whether the transform explains each match.
         overlap: share of the source that lies on the target.
         size: of the source, relative to the target.
+        fewest: points of the smaller cloud.
     """
     reasons = [f"{agrees.sum()} of {len(agrees)} matches agree"] if len(agrees) else []
     reasons.append(f"{overlap:.0%} of the source lies on the target")
+    if fewest < FEW_POINTS:
+        reasons.append(f"a cloud has only {fewest} points")
     if max(size, 1 / size) > OTHER_SIZE:
         times = f"{max(size, 1 / size):,.0f} times as large"
         reasons.append(f"one cloud is {times} as the other: do both have the same unit?")
@@ -279,6 +287,8 @@ class Cloud:
         """
         if isinstance(cloud, str | Path):
             raise CorrmatError(f"{name}: points are needed; corrmat.read_scan reads a file")
+        if isinstance(cloud, np.ma.MaskedArray):
+            raise CorrmatError(f"{name}: a masked array; pass the rows that count, or fill it")
         try:
             values = np.asarray(cloud, np.float64)
         except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError is torch's

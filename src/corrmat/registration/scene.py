@@ -21,16 +21,18 @@ class Scene:
 
     fixed: np.ndarray  # (M, 3) the target
     aligned: np.ndarray  # (N, 3) the source where it ends
+    middle: np.ndarray  # (3,) centroid of the aligned source, about which it rotates
     rotvec: np.ndarray  # (3,) rotation vector from where it ends to as it was given
     beside: float  # how far to the left it starts, so that the clouds do not hide each other
     matches: np.ndarray  # (K, 2) rows of source and target, the most confident first
     agrees: np.ndarray  # (K,) bool: whether the transform takes one end near the other
 
-    def source_at(self, progress: float) -> np.ndarray:
-        """Return the source (N, 3): as given, beside the target (0), to aligned (1)."""
-        left, middle = 1 - progress, np.nanmean(self.aligned, 0)
+    def source_at(self, progress: float, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """Return rows of the source: as given, beside the target (0), to aligned (1)."""
+        left = 1 - progress
         rotation = Rotation.from_rotvec(left * self.rotvec).as_matrix()
-        return (self.aligned - middle) @ rotation.T + middle - [left * self.beside, 0, 0]
+        centred = self.aligned[rows] - self.middle
+        return centred @ rotation.T + self.middle - [left * self.beside, 0, 0]
 
 
 def extent(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -76,6 +78,7 @@ def build_scene(
     return Scene(
         fixed,
         aligned,
+        np.nanmean(aligned, 0),
         rotvec=Rotation.from_matrix(axes.T @ rotation.T @ axes).as_rotvec(),
         beside=BESIDE * (_largest_extent(fixed) + _largest_extent(aligned)),
         matches=registration.matches[strongest],

@@ -10,6 +10,7 @@ from scipy.spatial import KDTree
 from corrmat.data.normals import NEIGHBORS
 from corrmat.types import MATCH_DISTANCE
 
+_TOO_SMALL = 10  # points, for small_gicp
 _SAME = 0.02  # of `max_distance`: points that lie nearer than this are one point
 _SHARED = 0.1  # share of the source's points that are the target's, too
 
@@ -62,7 +63,12 @@ class AlignmentScorer:
         return np.asarray(source.normals())[:, :3], np.asarray(target.normals())[:, :3]
 
     def refine(self, transform: np.ndarray, iterations: int = 30) -> np.ndarray:
-        """Refine a transform (4, 4) by generalised ICP (Segal et al., RSS 2009)."""
+        """Refine a transform (4, 4) by generalised ICP (Segal et al., RSS 2009).
+
+        Clouds of ten points or fewer keep it: their covariances say nothing, and small_gicp warns.
+        """
+        if min(len(self.source), len(self.target)) <= _TOO_SMALL:
+            return transform
         source, target, tree = self._clouds
         result = small_gicp.align(
             target,

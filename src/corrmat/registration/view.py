@@ -46,11 +46,16 @@ def registration_page(
         template="none",
         paper_bgcolor="rgba(0,0,0,0)",
         margin={"l": 0, "r": 0, "t": 0, "b": 0},
-        legend={"orientation": "h", "y": 0, "font": {"color": "#808080"}},
+        legend={
+            "orientation": "h",
+            "y": 0,
+            "font": {"color": "#808080"},
+            "itemsizing": "constant",
+        },
         scene={**axes, "aspectmode": "data", "camera": {"eye": {"x": 0.3, "y": -1.4, "z": 0.7}}},
     )
     path = {
-        "middle": np.nanmean(aligned, 0).tolist(),
+        "middle": scene.middle.tolist(),
         "rotvec": scene.rotvec.tolist(),
         "beside": scene.beside,
     }
