@@ -547,8 +547,8 @@ def test_the_last_title_of_an_animation_fits_into_it(pair):
 @pytest.mark.parametrize(
     ("confidence", "words"),
     [
-        (0.9, "aligned"),
-        (0.89, "probably aligned: why"),
+        (0.92, "aligned"),
+        (0.91, "probably aligned: why"),
         (0.5, "probably aligned: why"),
         (0.49, "doubtful: why"),
     ],

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from corrmat import weights
+from corrmat.calibration import SURE, Calibration
 from corrmat.data.datamodule import RegistrationDataModule
 from corrmat.data.pairs import STREAM, Key, make_pairs
 from corrmat.files import ensure_writable, replace_text
@@ -95,6 +96,12 @@ def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:
             aligned_alone += _aligned(result.per_pair)
     both = _fit_logistic(np.array(scores), np.array(aligned, float))
     alone = _fit_logistic(np.array(agreements)[:, None], np.array(aligned_alone, float))
+    curve = Calibration(both, alone)
+    sure = np.array([curve.confidence(*score) >= SURE for score in scores])
+    wrongly = np.mean(sure & ~np.array(aligned))
+    print(
+        f'called "aligned": {sure.mean():.1%} of {len(sure)} held-out pairs, {wrongly:.1%} wrongly'
+    )
     return {"both": both, "agreement": alone}, recalls
 
 
