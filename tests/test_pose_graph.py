@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from corrmat.calibration import SURE
 from corrmat.cli import main
 from corrmat.data.scans import read_scan, write_ply
 from corrmat.data.shapes.dataset import make_shape
@@ -39,15 +40,15 @@ def world(monkeypatch):
 
     def answer(source, target, **options):
         i, j = (next(k for k, s in enumerate(scans) if s is c) for c in (source, target))
-        found = poses[j] @ np.linalg.inv(poses[i])
-        turn = Rotation.from_rotvec(np.radians(noise["deg"]) * rng.standard_normal(3)).as_matrix()
-        centre = scans[j].mean(0)
-        found[:3, :3] = turn @ found[:3, :3]
-        found[:3, 3] = turn @ (found[:3, 3] - centre) + centre
-        confidence = 0.9
+        transform = poses[j] @ np.linalg.inv(poses[i])
+        rotvec = np.radians(noise["deg"]) * rng.standard_normal(3)
+        rotation, centre = Rotation.from_rotvec(rotvec).as_matrix(), scans[j].mean(0)
+        transform[:3, :3] = rotation @ transform[:3, :3]
+        transform[:3, 3] = rotation @ (transform[:3, 3] - centre) + centre
+        confidence = SURE
         if (i, j) in wrong:
-            found, confidence = transforms(1, seed=i + 7, far=5.0)[0], wrong[i, j]
-        return type("Result", (), {"transform": found, "confidence": confidence})()
+            transform, confidence = transforms(1, seed=i + 7, far=5.0)[0], wrong[i, j]
+        return type("Result", (), {"transform": transform, "confidence": confidence})()
 
     monkeypatch.setattr(pose_graph, "register", answer)
     return scans, poses, wrong, noise
@@ -65,7 +66,7 @@ def test_a_wrong_registration_is_outvoted(world):
     wrong[0, 3] = 0.6  # less sure than the way round it
     pose = register_scans(scans)[0]
     assert off(pose.transform, poses[3] @ np.linalg.inv(poses[0]), scans[0]) < 1e-8
-    assert (pose.agree, pose.confidence, pose.verdict) == (2, 0.9, "aligned")
+    assert (pose.agree, pose.confidence, pose.verdict) == (2, SURE, "aligned")
 
 
 def test_a_scan_that_fits_nowhere_is_doubtful(world):
