@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from plyfile import PlyData, PlyElement
 
-from corrmat.data.scans import CLOUDS, MESHES, read_scan, write_ply
+from corrmat.data.scans import CLOUDS, MESHES, read_scan, write_moved, write_ply
 from corrmat.errors import CorrmatError
 
 POINTS = np.random.default_rng(0).normal(size=(40, 3)) * 100
@@ -245,6 +246,67 @@ def test_an_npz_with_two_clouds_is_ambiguous(tmp_path):
 def test_an_npz_with_points_and_normals_has_points(tmp_path):
     np.savez(tmp_path / "cloud.npz", normals=POINTS[::-1], points=POINTS)
     assert (read_scan(tmp_path / "cloud.npz") == POINTS).all()
+
+
+def test_an_npz_names_its_points_in_any_case(tmp_path):
+    np.savez(tmp_path / "cloud.npz", Normals=POINTS[::-1], Points=POINTS)
+    assert (read_scan(tmp_path / "cloud.npz") == POINTS).all()
+
+
+def test_quoted_numbers_are_numbers(tmp_path):
+    (tmp_path / "table.csv").write_text('"a","x","y","z"\n"7","1.5","2","3"\n"7","4","5","6"\n')
+    assert read_scan(tmp_path / "table.csv").tolist() == [[1.5, 2, 3], [4, 5, 6]]
+    (tmp_path / "bare.csv").write_text('"1.5","2","3"\n"4","5","6"\n')
+    assert read_scan(tmp_path / "bare.csv").tolist() == [[1.5, 2, 3], [4, 5, 6]]
+
+
+def test_a_ply_may_name_its_axes_in_capitals(tmp_path):
+    write_ply(tmp_path / "cloud.ply", POINTS)
+    content = (tmp_path / "cloud.ply").read_bytes()
+    for axis in (b"x", b"y", b"z"):
+        content = content.replace(b"double " + axis, b"double " + axis.upper(), 1)
+    (tmp_path / "cloud.ply").write_bytes(content)
+    assert (read_scan(tmp_path / "cloud.ply") == POINTS).all()
+
+
+TURN = trimesh.transformations.rotation_matrix(1.0, [1, 2, 3])
+TURN[:3, 3] = 5e6, -1, 2
+
+
+def test_a_moved_ply_keeps_all_that_it_holds(tmp_path):
+    vertices = np.zeros(
+        40, [*((n, "f4") for n in ("x", "y", "z", "nx", "ny", "nz")), ("red", "u1")]
+    )
+    for name, column in zip("xyz", POINTS.T, strict=True):
+        vertices[name] = column
+    vertices["nz"], vertices["red"] = 1, np.arange(40)
+    faces = np.array([([0, 1, 2],), ([3, 4, 5, 6],)], [("vertex_indices", "O")])
+    elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
+    PlyData(elements, text=True, comments=["TextureFile a.png"]).write(tmp_path / "scan.ply")
+
+    write_moved(tmp_path / "moved.ply", tmp_path / "scan.ply", TURN)
+    moved = PlyData.read(tmp_path / "moved.ply")
+    points = np.stack([moved["vertex"][axis] for axis in "xyz"], 1)
+    expected = POINTS.astype(np.float32) @ TURN[:3, :3].T + TURN[:3, 3]
+    assert points.dtype == np.float64
+    np.testing.assert_allclose(points, expected, rtol=1e-13)
+    normals = np.stack([moved["vertex"][name] for name in ("nx", "ny", "nz")], 1)
+    np.testing.assert_allclose(normals, np.tile(TURN[:3, 2], (40, 1)), rtol=1e-12)
+    assert (moved["vertex"]["red"] == np.arange(40)).all()
+    assert [row.tolist() for row in moved["face"]["vertex_indices"]] == [[0, 1, 2], [3, 4, 5, 6]]
+    assert moved.comments == ["TextureFile a.png"]
+
+
+def test_a_moved_mesh_keeps_its_faces_and_a_cloud_its_points(tmp_path):
+    box = trimesh.creation.box((2, 4, 6))
+    box.export(tmp_path / "box.stl")
+    write_moved(tmp_path / "box.ply", tmp_path / "box.stl", TURN)
+    moved = trimesh.load(tmp_path / "box.ply")
+    assert len(moved.faces) == 12
+    assert moved.volume == pytest.approx(48)
+    write_moved(tmp_path / "cloud.ply", write(tmp_path / "cloud.xyz"), TURN)
+    expected = POINTS @ TURN[:3, :3].T + TURN[:3, 3]
+    np.testing.assert_allclose(read_scan(tmp_path / "cloud.ply"), expected, rtol=1e-15)
 
 
 def test_writing_into_no_folder_says_so(tmp_path):

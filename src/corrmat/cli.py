@@ -294,7 +294,7 @@ def _refuse_folder(path: Path) -> None:
 
 def _register_pair(options: Namespace) -> int:
     """Register one file onto another."""
-    from corrmat.data.scans import read_scan, write_ply
+    from corrmat.data.scans import read_scan, write_moved
     from corrmat.files import replace_bytes, replace_text
 
     names = str(options.source[0]), str(options.target)
@@ -306,9 +306,8 @@ def _register_pair(options: Namespace) -> int:
     )
     print(to_text(registration))
     if options.output is not None:
-        rotation, translation = registration.transform[:3, :3], registration.transform[:3, 3]
-        write_ply(options.output, source @ rotation.T + translation)
-        print(f"moved source, its points alone: {options.output}")
+        write_moved(options.output, options.source[0], registration.transform)
+        print(f"moved source: {options.output}")
     if options.json is not None:
         replace_text(options.json, to_json(registration, *names))
         print(f"result: {options.json}")
@@ -329,7 +328,7 @@ def _register_several(options: Namespace) -> int:
     """Register several files onto one."""
     if options.html or options.gif:
         raise CorrmatError("--html and --gif show two scans; --output moves several, to look at")
-    from corrmat.data.scans import read_scan, write_ply
+    from corrmat.data.scans import read_scan, write_moved
     from corrmat.files import replace_text
 
     scans = [read_scan(path, options.seed) for path in (*options.source, options.target)]
@@ -341,8 +340,8 @@ def _register_several(options: Namespace) -> int:
     print(pose_graph.to_text(options.source, options.target, poses))
     if options.output is not None:
         options.output.mkdir(parents=True, exist_ok=True)
-        for path, scan, pose in zip(_moved_files(options), scans, poses, strict=False):
-            write_ply(path, scan @ pose.transform[:3, :3].T + pose.transform[:3, 3])
+        for path, scan, pose in zip(_moved_files(options), options.source, poses, strict=True):
+            write_moved(path, scan, pose.transform)
         print(f"moved scans: {options.output}")
     if options.json is not None:
         replace_text(options.json, pose_graph.to_json(options.source, options.target, poses))

@@ -1,6 +1,7 @@
 """The one error type that users see, and the checks that settings and networks share."""
 
 import dataclasses
+import re
 import textwrap
 import typing
 
@@ -10,9 +11,12 @@ class CorrmatError(Exception):
 
 
 def short_message(error: Exception) -> str:
-    """Return the first two lines of an error of a library as one line."""
+    """Return the first two lines of an error of a library as one line, types in plain words."""
     lines = [line.strip(" -") for line in str(error).splitlines() if line.strip(" -")]
-    return textwrap.shorten(" ".join(lines[:2]), 400, placeholder=" ...") or type(error).__name__
+    text = re.sub(r'Parser key "(.*?)": Expected a', r"\1: expected", " ".join(lines[:2]))
+    text = re.sub(r"<class '(\w+)'>", r"\1", text)
+    text = re.sub(r"typing\.Literal\[([^]]*)\]", r"one of \1", text)
+    return textwrap.shorten(text, 400, placeholder=" ...") or type(error).__name__
 
 
 def require_positive(**sizes: int) -> None:

@@ -306,7 +306,7 @@ def _add_register_options(parser: ArgumentParser) -> None:
     parser.add_argument("target", type=Path, help="the cloud or mesh that they are moved onto")
     parser.add_argument(
         "-o", "--output", type=Path, metavar="PLY",
-        help="write the moved source (the points sampled on it, if it is a mesh); the folder to "
+        help="write the moved source, with the faces and colours that a PLY has; the folder to "
         "write them into, if there are several",
     )  # fmt: skip
     parser.add_argument("--json", type=Path, help="write matrix, confidence and verdict")
@@ -325,7 +325,10 @@ def _add_register_options(parser: ArgumentParser) -> None:
 
 def _count(text: str) -> int:
     """Parse a seed or a number of things."""
-    value = int(text)
+    try:
+        value = int(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is no whole number") from error
     if not 0 <= value < 2**32:
         raise argparse.ArgumentTypeError(f"{value} is not between 0 and 2^32")
     return value

@@ -5,6 +5,7 @@ Each reader is imported on first use: together they take longer than a registrat
 
 import io
 import re
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,7 @@ from corrmat.errors import CorrmatError
 from corrmat.files import replace_bytes
 
 if TYPE_CHECKING:
+    import plyfile
     import trimesh
 
 MESHES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
@@ -21,6 +23,7 @@ CLOUDS = (".pcd", ".xyz", ".txt", ".csv", ".asc", ".pts", ".npy", ".npz")
 SAMPLES = 20_000  # points taken of a mesh's surface
 _POINTS = ("points", "xyz", "pos")  # usual names of an array of points beside others
 _XYZ = {"x", "y", "z"}
+_END, _LONGEST_HEADER = b"end_header", 65_536  # of a PLY file, in bytes
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+").fullmatch
 _FACES = re.compile(rb"^element (face|tristrips) +[1-9]", re.MULTILINE)
 
@@ -98,22 +101,74 @@ def read_shape(path: Path) -> "np.ndarray | trimesh.Trimesh":
     return points
 
 
-def write_ply(path: Path, points: np.ndarray) -> None:
+def write_moved(path: Path, scan: Path, transform: np.ndarray) -> None:
+    """Write a scan, moved by a rigid transform, as a binary PLY with coordinates in doubles.
+
+    A PLY file keeps its faces, its colours and whatever else it holds; its normals turn with it.
+    Another mesh keeps its vertices and faces, another cloud its points.
+
+    Args:
+        path: to write.
+        scan: the file to move, as `read_scan` takes it.
+        transform: (4, 4) float64.
+
+    Raises:
+        CorrmatError: there is no folder to write into, or see `read_scan`.
+    """
+    rotation, translation = transform[:3, :3], transform[:3, 3]
+    if scan.suffix.lower() != ".ply":
+        shape = read_shape(scan)
+        is_cloud = isinstance(shape, np.ndarray)
+        points, faces = (shape, None) if is_cloud else (shape.vertices, shape.faces)
+        write_ply(path, points @ rotation.T + translation, faces)
+        return
+    content = _ply_content(scan)
+    vertices = content["vertex"]
+    for names, shift in (("xyz", translation), (("nx", "ny", "nz"), 0.0)):
+        if fields := _fields(vertices, names):
+            moved = _stack(vertices, fields) @ rotation.T + shift
+            for field in fields:
+                vertices.ply_property(field).val_dtype = "f8"
+            vertices.data = vertices.data.astype([(p.name, p.dtype()) for p in vertices.properties])
+            for field, column in zip(fields, moved.T, strict=True):
+                vertices[field] = column
+    content.text, content.byte_order = False, "<"
+    written = io.BytesIO()
+    content.write(written)
+    _replace(path, written.getbuffer())
+
+
+def write_ply(path: Path, points: np.ndarray, faces: np.ndarray | None = None) -> None:
     """Write points (N, 3) as a binary PLY of doubles, which keep detail far from the origin.
+
+    Args:
+        path: to write.
+        points: (N, 3).
+        faces: (F, 3) rows of points, if they are the vertices of a mesh.
 
     Raises:
         CorrmatError: there is no such folder.
     """
-    if not path.parent.is_dir():
-        raise CorrmatError(f"no folder {path.parent} to write {path.name} into")
     header = [
         "ply",
         "format binary_little_endian 1.0",
         f"element vertex {len(points)}",
         *(f"property double {axis}" for axis in "xyz"),
-        "end_header\n",
     ]
-    replace_bytes(path, "\n".join(header).encode() + points.astype("<f8").tobytes())
+    body = points.astype("<f8").tobytes()
+    if faces is not None:
+        header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+        triangles = np.empty(len(faces), [("corners", "u1"), ("rows", "<i4", 3)])
+        triangles["corners"], triangles["rows"] = 3, faces
+        body += triangles.tobytes()
+    _replace(path, "\n".join([*header, "end_header\n"]).encode() + body)
+
+
+def _replace(path: Path, content: bytes | memoryview) -> None:
+    """Write a file into a folder that exists."""
+    if not path.parent.is_dir():
+        raise CorrmatError(f"no folder {path.parent} to write {path.name} into")
+    replace_bytes(path, content)
 
 
 def _scene(path: Path) -> "np.ndarray | trimesh.Trimesh":
@@ -138,19 +193,35 @@ def _scene(path: Path) -> "np.ndarray | trimesh.Trimesh":
 
 def _ply(path: Path) -> "np.ndarray | trimesh.Trimesh":
     """Return the vertices of a PLY file without faces; read one with faces as a mesh."""
-    from plyfile import PlyData
-
     with path.open("rb") as file:
-        header = b""
-        for line in file:
-            header += line
-            if line.startswith(b"end_header"):
-                break
-        if _FACES.search(header):
-            return _scene(path)
-        header = header.decode("ascii", "replace").encode("ascii", "replace")  # comments
-        vertices = PlyData.read(io.BytesIO(header + file.read()))["vertex"]
-    return np.stack([np.asarray(vertices[axis], np.float64) for axis in "xyz"], 1)
+        header = file.read(_LONGEST_HEADER).partition(_END)[0]
+    if _FACES.search(header):
+        return _scene(path)
+    vertices = _ply_content(path)["vertex"]
+    fields = _fields(vertices, "xyz")
+    if not fields:
+        raise CorrmatError(f"{path}: its vertices have no x, y and z")
+    return _stack(vertices, fields)
+
+
+def _ply_content(path: Path) -> "plyfile.PlyData":
+    """Read a PLY file, whose comments may be in any encoding."""
+    import plyfile
+
+    header, end, body = path.read_bytes().partition(_END)
+    header = header.decode("ascii", "replace").encode("ascii", "replace")
+    return plyfile.PlyData.read(io.BytesIO(header + end + body))
+
+
+def _fields(vertices: "plyfile.PlyElement", names: Iterable[str]) -> list[str]:
+    """Find the properties of these names, in lower or upper case; none if one is missing."""
+    present = {p.name.lower(): p.name for p in vertices.properties}
+    return [present[name] for name in names] if present.keys() >= set(names) else []
+
+
+def _stack(vertices: "plyfile.PlyElement", fields: Sequence[str]) -> np.ndarray:
+    """Put three properties of the vertices side by side: (N, 3) float64."""
+    return np.stack([np.asarray(vertices[field], np.float64) for field in fields], 1)
 
 
 def _pcd(path: Path) -> np.ndarray:
@@ -169,7 +240,7 @@ def _numpy(path: Path) -> np.ndarray:
         return np.stack([content[axis].ravel() for axis in "xyz"], 1) if is_table else content
     with content:
         names = [n for n in content.files if content[n].ndim == 2 and content[n].shape[1] >= 3]
-        names = [name for name in names if name in _POINTS] or names
+        names = [name for name in names if name.lower() in _POINTS] or names
         if len(names) != 1:
             raise CorrmatError(
                 f"{path} holds {len(names)} arrays of points (N, 3), not one: {content.files}"
@@ -196,7 +267,7 @@ def _text(path: Path) -> np.ndarray:
     columns = [0, 1, 2]
     first = _cells(lines[0].lstrip("/ "), separator) if lines else []
     if lines and not any(map(_is_number, first)):  # a header
-        names = [word.strip("\"'").lower() for word in first]
+        names = [word.lower() for word in first]
         if not _XYZ.issubset(names):
             raise CorrmatError(
                 f"{path}: the header names {', '.join(names)}, but not x, y and z; rename them, or "
@@ -212,7 +283,7 @@ def _text(path: Path) -> np.ndarray:
         return np.empty((0, 3))
     try:
         return np.loadtxt(lines, np.float64, comments=None, delimiter=separator, usecols=columns,
-                          ndmin=2)  # fmt: skip
+                          ndmin=2, quotechar='"')  # fmt: skip
     except ValueError:
         _check_rows(path, lines, separator, columns)
         raise
@@ -234,8 +305,8 @@ def _check_rows(path: Path, lines: list[str], separator: str | None, columns: li
 
 
 def _cells(line: str, separator: str | None) -> list[str]:
-    """Split a line at its separator, or else at its white space."""
-    return [cell.strip() for cell in line.split(separator)]
+    """Split a line at its separator, or else at its white space; take off quotes."""
+    return [cell.strip(" \t\"'") for cell in line.split(separator)]
 
 
 def _is_number(word: str) -> bool:
