@@ -41,7 +41,7 @@ def refuse_existing(paths: Iterable[Path]) -> None:
     """
     for path in paths:
         if path.exists():
-            raise CorrmatError(f"{path} is there already; choose another folder")
+            raise CorrmatError(f"{path} is there already; delete it or choose another folder")
 
 
 def ensure_writable(folder: Path) -> None:

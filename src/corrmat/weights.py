@@ -150,7 +150,7 @@ def export_model(model: str | Path, folder: str | Path) -> None:
 
     Raises:
         CorrmatError: there are no such weights, or they are an exported model; the folder holds
-            files of these names that are none.
+            files of these names already.
     """
     model, folder = str(model), Path(folder)
     if model == "corrmat" or model in shipped_models():
@@ -169,11 +169,10 @@ def export_model(model: str | Path, folder: str | Path) -> None:
     config = {"library_name": "corrmat", **about, "network": json.loads(about["network"])}
     files = {
         _MODEL_FILE: content,
-        "config.json": (json.dumps(config, indent=1) + "\n").encode(),
+        "config.json": (json.dumps(config, indent=1, sort_keys=True) + "\n").encode(),
         "README.md": card.encode(),
     }
-    if not (folder / _MODEL_FILE).exists():  # it is not an earlier export
-        refuse_existing(map(folder.joinpath, files))
+    refuse_existing(folder / name for name in files)
     folder.mkdir(parents=True, exist_ok=True)
     for name, written in files.items():
         replace_bytes(folder / name, written)
