@@ -486,9 +486,11 @@ def draw(growth: dict[str, list[Row]], exponents: dict[str, Any], path: Path) ->
             axes.loglog(n, low * (n / left) ** power, ":", color="grey", zorder=0)
             end = min(right, left * (high / low) ** (1 / power))
             at = end, low * (end / left) ** power
-            axes.annotate(label, at, ha="right", va="top", color="grey")
+            axes.annotate(
+                label, at, (-4, -6), textcoords="offset points", ha="right", va="top", color="grey"
+            )
         axes.set(xlim=(left, right), ylim=(low, high))
-        axes.set(xlabel="points N of either cloud", title=title)
+        axes.set(xlabel="points N of each cloud", title=title)
         axes.set_xticks(POINTS, [str(n) for n in POINTS], minor=False)
         axes.tick_params(axis="x", which="minor", bottom=False, labelbottom=False)
         axes.grid(alpha=0.3)

@@ -3,7 +3,7 @@
     python benchmarks/choice.py        minutes
 
 A candidate's score is agreement + a * coherence + b * unmatched loss + c * support
-(`registration/register.py`). This tests weights and refinements on pairs of training shapes that
+(`registration/choice.py`). This tests weights and refinements on pairs of training shapes that
 no training of the network but the first saw, and writes results/register/choice.json. The weights
 in use were chosen on other pairs of these shapes. `right_matches` is how many of the network's
 matches, by weight, the true transform explains, for several numbers of anchors that its points
@@ -23,19 +23,18 @@ from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG
 from corrmat.networks.invariant import InvariantNetwork
 from corrmat.ops import rigid
 from corrmat.registration import benchmark
-from corrmat.registration.em_icp import em_icp
-from corrmat.registration.hypotheses import Hypotheses, NetworkHypotheses
-from corrmat.registration.register import (
-    CANDIDATE_STEPS,
+from corrmat.registration.choice import (
     CHOICE_WEIGHTS,
-    STEPS_WITHOUT_MATCHES,
+    ChoiceWeights,
     choose,
     distinct,
     measure,
-    prepare_clouds,
     refine_chosen,
-    to_original_units,
 )
+from corrmat.registration.em_icp import em_icp
+from corrmat.registration.hypotheses import Hypotheses, NetworkHypotheses
+from corrmat.registration.preparation import prepare_clouds, to_original_units
+from corrmat.registration.register import CANDIDATE_STEPS, STEPS_WITHOUT_MATCHES
 from corrmat.registration.shipping import held_out_pairs
 from corrmat.revision import commit
 from corrmat.types import PairBatch
@@ -43,13 +42,13 @@ from corrmat.weights import load_model
 
 PATH = Path(__file__).resolve().parents[1] / "results" / "register" / "choice.json"
 _COHERENCE, _UNMATCHED, _SUPPORT = CHOICE_WEIGHTS
-TRIED = (
+TRIED = [ChoiceWeights(*tried) for tried in (
     (0.0, 0.0, 0.0), (1.5, 0.0, 0.0), (_COHERENCE, 0.0, 0.0), (0.0, _UNMATCHED, 0.0),
     (0.0, 0.0, _SUPPORT), (_COHERENCE, _UNMATCHED, 0.0), CHOICE_WEIGHTS,
     (_COHERENCE / 2, _UNMATCHED, _SUPPORT), (2 * _COHERENCE, _UNMATCHED, _SUPPORT),
     (_COHERENCE, _UNMATCHED / 2, _SUPPORT), (_COHERENCE, 2 * _UNMATCHED, _SUPPORT),
     (_COHERENCE, _UNMATCHED, _SUPPORT / 2), (_COHERENCE, _UNMATCHED, 2 * _SUPPORT),
-)  # fmt: skip
+)]  # fmt: skip
 PAIRS: dict[benchmark.Protocol, int] = {"real": 200, "views": 120, "clean": 80}
 ANCHORS = 64, 256
 PRIORS = "without matches", "with matches"  # of EM-ICP

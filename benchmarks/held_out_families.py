@@ -15,6 +15,7 @@ from pathlib import Path
 from corrmat.cli import main as corrmat
 from corrmat.data.shapes.dataset import NAMES, SIZE
 from corrmat.registration import benchmark
+from corrmat.revision import commit
 from corrmat.types import PairBatch
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -49,6 +50,7 @@ def pairs_of(pairs: PairBatch, group: str) -> PairBatch:
 
 def main(root: str | None = None) -> None:
     """Train both, then test each on all pairs."""
+    code = commit()
     pairs = benchmark.frozen_pairs("real", count=SIZE["test"])
     tests = {group: pairs_of(pairs, group) for group in GROUPS}
     if root is not None:
@@ -61,7 +63,7 @@ def main(root: str | None = None) -> None:
     print(benchmark.to_table(results))
     about = {"protocol": "real", "points": 512, **{name: list(g) for name, g in GROUPS.items()}}
     path = ROOT / "results" / "register" / "held_out_families.json"
-    benchmark.write_results(path, results, about | {"settings": SETTINGS})
+    benchmark.write_results(path, results, about | {"commit": code, "settings": SETTINGS})
 
 
 if __name__ == "__main__":

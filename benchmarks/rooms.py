@@ -1,4 +1,4 @@
-"""Fragments of rooms: the shipped weights beside pipelines made for rooms, at their own settings.
+"""Fragments of rooms: the shipped weights beside RANSAC and KISS-Matcher, at their own settings.
 
     python benchmarks/rooms.py        minutes; needs pip install -e '.[baselines]'
 
@@ -18,11 +18,12 @@ from rich.progress import track
 from corrmat.baselines import FpfhSettings, KissSettings, fpfh_ransac, kiss_matcher
 from corrmat.registration import benchmark
 from corrmat.registration.scoring import AlignmentScorer
+from corrmat.revision import commit
 from corrmat.types import PairBatch
 
 RESULTS = Path(__file__).resolve().parents[1] / "results" / "register"
-POINTS, TEST_ROOMS, TUNING_ROOMS = 20_000, 60, 20
-VOXELS_M = {"ransac": (0.08, 0.12, 0.18, 0.27, 0.4), "kiss": (0.1, 0.15, 0.22)}
+POINTS, TEST_ROOMS, TUNING_ROOMS = 20_000, 60, 60
+VOXELS_M = {"ransac": (0.08, 0.12, 0.18, 0.27, 0.4), "kiss": (0.07, 0.1, 0.15, 0.22)}
 
 
 def ransac(source: np.ndarray, target: np.ndarray, voxel: float) -> np.ndarray:
@@ -65,6 +66,7 @@ def run(pairs: PairBatch, name: str, voxel: float) -> benchmark.ModelResult:
 
 def main() -> None:
     """Choose the voxels, then compare."""
+    code = commit()
     tuning = benchmark.frozen_pairs("rooms", points=POINTS, count=TUNING_ROOMS, split="val")
     tried = {
         name: {voxel: run(tuning, name, voxel).recall_5deg for voxel in voxels}
@@ -78,7 +80,7 @@ def main() -> None:
     print(benchmark.to_table(results))
     about = {"protocol": "rooms", "data": "procedural", "points": POINTS, "pairs": len(pairs)}
     path = RESULTS / f"rooms-procedural-{POINTS}.json"
-    benchmark.write_results(path, results, about | {"tuning": tried})
+    benchmark.write_results(path, results, about | {"commit": code, "tuning": tried})
 
 
 if __name__ == "__main__":

@@ -68,17 +68,17 @@ def test_the_command_prints_one_table_and_writes_a_record(pairs, tmp_path, capsy
     assert record["pairs"] == 4
     assert len(record["models"]["icp"]["per_pair"]["rotation_error_deg"]) == 4
     assert record["models"]["corrmat"]["recall_5deg"] >= record["models"]["icp"]["recall_5deg"]
-    summary = comparisons.comparison_summary(tmp_path / "results", 256)
-    assert summary.splitlines()[0] == "| pairs | data | icp | corrmat |"
+    summary = comparisons.comparison_summary(tmp_path / "results")
+    assert summary.splitlines()[0] == "| pairs | data | points | icp | corrmat |"
     assert re.match(
-        r"\| clean \| shapes \| \d+% \| \d+% \(\d+ to \d+\) \|", summary.splitlines()[2]
+        r"\| clean \| shapes \| 256 \| \d+% \| \d+% \(\d+ to \d+\) \|", summary.splitlines()[2]
     )
     rows = comparisons.comparison_table(tmp_path / "results").splitlines()[2:]
     assert [row.split(" | ")[3] for row in rows] == ["icp", "corrmat"]
     confidence = comparisons.confidence_table(tmp_path / "results")
-    assert re.search(
-        r"4 pairs of single objects: .*, \d are called .aligned., \d of them wrongly, ", confidence
-    )
+    rows = [row.split(" | ") for row in confidence.splitlines() if "| shapes |" in row]
+    assert sum(int(row[2]) for row in rows) == 4
+    assert "4 pairs of single objects: expected calibration error over 10 bins 0." in confidence
 
 
 def test_calibration_intervals_and_paired_test_by_hand():

@@ -131,10 +131,12 @@ def test_a_curve_with_errors_that_are_no_numbers_or_without_a_point():
 
 def test_the_verdicts_are_counted():
     claim = claims.Claim("", "", "", "", "confirmed")
-    other = dataclasses.replace(claim, verdict="not shown")
+    other = dataclasses.replace(claim, verdict="not shown", kind="registers better")
     assert claims.count_verdicts([claim, other, claim]) == (
-        "2 confirmed, 0 confirmed in direction, 1 not shown, 0 contradicted "
-        "(3 verdicts on 1 claims)"
+        "*registers better* (1 records): 0 confirmed, 0 confirmed in direction, 1 not shown, "
+        "0 contradicted; "
+        "*other claims* (2 records): 2 confirmed, 0 confirmed in direction, 0 not shown, "
+        "0 contradicted"
     )
 
 

@@ -112,6 +112,7 @@ def test_corrmat_alone_says_what_it_can_do(capsys):
     [
         (["evaluate", *FIT[1:], "--record", "x.json"], "nrecognized arguments: --record"),
         (["compare", "icp", "--config", "x.yaml"], "nrecognized arguments: --config"),
+        (["compare", ","], "which models?"),
         (["compare", "icp", "--keep", "1"], "nrecognized arguments: --keep"),
         (["compare", "icp", "--record", "file/x.json"], "cannot write to file"),
         (["compare", "icp", "--record", "."], "is a folder, not a file"),

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from conftest import ROOT
 from sybil import Sybil
 from sybil.parsers.markdown import PythonCodeBlockParser
@@ -15,7 +14,7 @@ from corrmat.data.shapes import dataset
 from corrmat.methods import METHODS, DCPCorr
 from corrmat.networks.dcp import DCPNetwork
 from corrmat.options import parse
-from corrmat.weights import load_reference
+from corrmat.weights import load_model
 
 PAGES = ["README.md", *sorted(str(p.relative_to(ROOT)) for p in (ROOT / "docs").glob("*.md"))]
 COMMAND = re.compile(r"^(?:\.venv/bin/)?(corrmat .*?|make .*?)(?:\s+#.*|\s*&&.*)?$")
@@ -31,20 +30,15 @@ def test_python_blocks_are_executed(page, tmp_path, monkeypatch):
     cloud = dataset.make_shape(("test", 0))[0][:300, :3]
     np.save("source.npy", cloud)
     np.save("target.npy", cloud[::-1] + 0.5)
-    monkeypatch.setattr("corrmat.load_reference", any_reference)
+    monkeypatch.setattr("corrmat.load_model", load_or_stand_in)
     monkeypatch.setitem(METHODS, "MineCorr", DCPCorr)  # a block names its own so: restored after
-    monkeypatch.setattr(torch, "load", loader_without_the_authors_file(torch.load))
     for example in document.examples():
         example.evaluate()
 
 
-def any_reference(kind, state, **hparams):
-    """The authors' file is not committed: where a block names it, an empty state stands for it."""
-    return load_reference(kind, state, **hparams) if state else DCPNetwork()
-
-
-def loader_without_the_authors_file(load):
-    return lambda path, **options: {} if path == "dcp_v1.t7" else load(path, **options)
+def load_or_stand_in(model):
+    """The authors' file is not committed: an untrained network stands for it."""
+    return DCPNetwork() if model == "dcp_v1.t7" else load_model(model)
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -38,6 +38,8 @@ class MineNetwork(nn.Module):
 
     def __init__(self, width: int = 8, broken: bool = False) -> None:
         super().__init__()
+        if width > 1000:
+            raise ValueError("my own limit")
         self.embed = nn.Linear(3, width)
         self.broken = broken
 
@@ -133,6 +135,8 @@ def test_a_method_a_data_set_and_a_loss_setting_of_ones_own_leave_a_record(mine,
 
 
 def test_a_mistake_inside_a_network_keeps_its_traceback(mine):
+    with pytest.raises(ValueError, match="my own limit"):
+        prepare(mine(width=1001).arms["MineCorr"])
     settings = mine(broken=True).arms["MineCorr"]
     with pytest.raises(RuntimeError, match="my own mistake") as caught:
         prepare(settings)

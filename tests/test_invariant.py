@@ -204,7 +204,7 @@ def test_a_perfect_prediction_costs_next_to_nothing(generator):
 
 @pytest.mark.slow
 def test_the_method_learns_eight_pairs_of_two_scans(generator):
-    """Halfway; `test_learning.py` has simpler pairs learnt by heart."""
+    """Most of the way; `test_learning.py` has simpler pairs learnt by heart."""
     torch.manual_seed(0)
     settings = PairSettings(64, keep=0.7, sampling="disjoint", outliers=0.05, outlier_distance=0.2,
         corrupted="both", normals="estimated")  # fmt: skip
@@ -213,13 +213,13 @@ def test_the_method_learns_eight_pairs_of_two_scans(generator):
     method = InvariantCorr(network, loss={"max_distance": 0.2})
     adam = torch.optim.Adam(method.parameters(), 3e-3)
     losses = []
-    for _ in range(100):
+    for _ in range(200):
         loss = method.loss(method(batch.source, batch.target), batch)
         adam.zero_grad()
         loss.backward()
         adam.step()
         losses.append(float(loss.detach()))
-    assert losses[-1] < 0.5 * losses[0]
+    assert losses[-1] < 0.4 * losses[0]
 
 
 def test_a_network_without_doubt_cannot_be_trained_so(generator):

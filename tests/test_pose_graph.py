@@ -13,7 +13,7 @@ from corrmat.data.shapes.dataset import make_shape
 from corrmat.errors import CorrmatError
 from corrmat.registration import pose_graph
 from corrmat.registration.pose_graph import register_scans
-from corrmat.registration.register import Cloud
+from corrmat.registration.preparation import Cloud
 
 
 def transforms(count, seed=0, far=0.0):

@@ -19,7 +19,8 @@ from corrmat.data.scans import read_scan
 from corrmat.errors import CorrmatError
 from corrmat.ops import rigid
 from corrmat.ops.correspondence import MatchabilityCorrespondence, SoftCorrespondence
-from corrmat.registration.register import Cloud, register
+from corrmat.registration.preparation import Cloud
+from corrmat.registration.register import register
 
 settings.register_profile(
     "corrmat", deadline=None, suppress_health_check=list(HealthCheck), derandomize=True
@@ -187,7 +188,7 @@ def _file(kind):
     if kind in (".npy", ".npz"):
         (np.save if kind == ".npy" else np.savez)(buffer, points)
         return buffer.getvalue()
-    if kind in (".xyz", ".csv", ".txt"):
+    if kind in (".xyz", ".csv", ".txt", ".asc", ".pts"):
         return "\n".join(" ".join(map(str, row)) for row in points).encode()
     if kind == ".pcd":
         head = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 12\nHEIGHT 1\n"
@@ -203,7 +204,7 @@ def _file(kind):
 
 KINDS = (
     ".ply", ".stl", ".off", ".obj", ".glb", ".gltf",
-    ".pcd", ".xyz", ".txt", ".csv", ".npy", ".npz",
+    ".pcd", ".xyz", ".txt", ".csv", ".asc", ".pts", ".npy", ".npz",
 )  # fmt: skip
 WHOLE = {kind: _file(kind) for kind in KINDS}
 

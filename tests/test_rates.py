@@ -6,8 +6,10 @@ import math
 import pytest
 from conftest import ROOT
 
-from corrmat.errors import CorrmatError
+from corrmat.errors import CorrmatError, DivergedError
+from corrmat.reporting import documents
 from corrmat.training import rates, recipe
+from corrmat.training.runs import TrainedArm
 
 SWEPT = sorted((ROOT / "results" / "rates").glob("*/*/*.json"))
 
@@ -56,8 +58,27 @@ def rate(lr, error):
     return rates.RateResult(lr, error, 1.0, 100, None)
 
 
-def test_a_rate_whose_error_is_no_number_is_not_chosen():
-    assert rates.chosen([rate(1.0, math.nan), rate(2.0, 5.0), rate(3.0, 9.0)]) == 2.0
+def test_a_rate_that_diverged_is_not_chosen():
+    assert rates.chosen([rate(1.0, None), rate(2.0, 5.0), rate(3.0, 9.0)]) == 2.0
+    with pytest.raises(CorrmatError, match="diverged at every rate: 1.0, 2.0"):
+        rates.chosen([rate(1.0, None), rate(2.0, None)])
+
+
+def test_a_rate_that_diverges_does_not_end_the_sweep(tmp_path, monkeypatch):
+    def diverge_at_the_highest(recipe, arm, *others, **options):
+        if arm.name.endswith("-0.006"):
+            raise DivergedError("the loss is nan")
+        curve = [{"rotation_error_deg_mean": arm.settings.optimizer.lr, "loss": math.nan}]
+        return TrainedArm(tmp_path, 48, 1.0, None, curve)
+
+    monkeypatch.setattr(rates, "train_or_reuse", diverge_at_the_highest)
+    rates.sweep(load("1.2", "smoke"), tmp_path / "results", tmp_path / "runs")
+    text = (tmp_path / "results/rates/smoke/shapes/1.2.json").read_text()
+    assert "NaN" not in text
+    arm = json.loads(text)["arms"]["DCP_corr"]
+    assert arm["chosen"] == 0.00067
+    assert [each["rotation_error_deg_mean"] for each in arm["rates"]] == [0.00067, 0.002, None]
+    assert "0.006: diverged" in documents.rates_table(tmp_path / "results")
 
 
 def test_a_budget_in_epochs_has_no_twentieth(tmp_path):

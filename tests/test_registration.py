@@ -23,9 +23,10 @@ from corrmat.data.normals import estimate_normals
 from corrmat.data.scans import read_scan, write_ply
 from corrmat.data.shapes.dataset import make_shape
 from corrmat.errors import CorrmatError
+from corrmat.methods import InvariantCorr
 from corrmat.ops import rigid
 from corrmat.ops.correspondence import MatchabilityCorrespondence, SoftCorrespondence
-from corrmat.registration import example
+from corrmat.registration import choice, example, preparation, result
 from corrmat.registration import register as registration
 from corrmat.registration.animation import _title, registration_gif
 from corrmat.registration.hypotheses import (
@@ -272,9 +273,9 @@ def test_clouds_that_have_nothing_in_common_are_doubtful(pair):
 
 def test_many_points_are_subsampled_evenly():
     cloud = np.random.default_rng(0).normal(size=(100_000, 3))
-    actual = registration.Cloud.of(cloud, "source", 0)
-    assert len(actual.rows) == registration.FULL_POINTS
-    assert len(set(actual.rows.tolist())) == registration.FULL_POINTS
+    actual = preparation.Cloud.of(cloud, "source", 0)
+    assert len(actual.rows) == preparation.FULL_POINTS
+    assert len(set(actual.rows.tolist())) == preparation.FULL_POINTS
     assert np.abs(actual.centre).max() < 0.03
     assert abs(np.median(actual.rows) - 50_000) < 1500  # from everywhere in the file
 
@@ -286,7 +287,7 @@ def test_the_animation_speaks_of_matches_where_there_are_some(pair, model, said,
     monkeypatch.setattr(Text, "set_text", lambda t, s: (titles.append(str(s)), original(t, s))[1])
     _, source, target, _ = pair
     registration_gif(corrmat.register(source, target, model=model), source, target)
-    assert sum("of the matches" in title for title in titles) == said
+    assert sum("strongest matches" in title for title in titles) == said
 
 
 def test_the_command_writes_what_it_promises(pair, tmp_path, capsys):
@@ -564,9 +565,9 @@ def test_a_network_of_ones_own_registers():
     named, given = (corrmat.register(cloud, cloud + 1, model=m) for m in ("corrmat", network))
     np.testing.assert_array_equal(named.transform, given.transform)
     assert given.model == "InvariantNetwork"
-    wrapped = torch.nn.Module()
-    wrapped.network = network  # as a LightningModule has it
-    assert corrmat.register(cloud, cloud + 1, model=wrapped).confidence == given.confidence
+    method = InvariantCorr()
+    method.network = network
+    assert corrmat.register(cloud, cloud + 1, model=method).confidence == given.confidence
     with pytest.raises(CorrmatError, match=r"corrmat.read_scan reads a file"):
         corrmat.register("a.ply", cloud)
 
@@ -585,6 +586,29 @@ class Fixed(torch.nn.Module):
         return Prediction(self.value * torch.eye(3)[None], torch.zeros(1, 3))
 
 
+class Mirrored(torch.nn.Module):
+    """Wraps the shipped network, and hands its clouds over changed."""
+
+    def __init__(self):
+        super().__init__()
+        self.network = load_model()
+        self.calls = 0
+
+    def forward(self, source, target):
+        self.calls += 1
+        return self.network(source.flip(1), target)
+
+
+def test_a_wrapper_runs_its_own_forward_and_needs_what_its_network_needs(pair):
+    wrapper = Mirrored()
+    assert corrmat.register(*pair[1:3], model=wrapper).model == "Mirrored"
+    assert wrapper.calls == 1
+    wrapper.network = load_model("1.2/DCP_corr")
+    few = np.random.default_rng(0).normal(size=(5, 3))
+    with pytest.raises(CorrmatError, match="needs clouds of at least"):
+        corrmat.register(few, few, model=wrapper)
+
+
 def test_a_network_keeps_its_mode_and_must_not_predict_nonsense():
     network = Fixed(1.0)
     assert corrmat.register(GRID, GRID, model=network).rotation_deg == pytest.approx(0, abs=1e-4)
@@ -597,9 +621,7 @@ def test_a_network_keeps_its_mode_and_must_not_predict_nonsense():
 
 def test_only_the_shipped_weights_have_a_calibrated_confidence(pair):
     _, source, target, _ = pair
-    texts = [
-        registration.to_text(corrmat.register(source, target, model=m)) for m in ("corrmat", "icp")
-    ]
+    texts = [result.to_text(corrmat.register(source, target, model=m)) for m in ("corrmat", "icp")]
     assert ["fitted to the shipped weights" in text for text in texts] == [False, True]
 
 
@@ -667,9 +689,9 @@ def test_only_a_network_with_matchabilities_says_which_points_have_no_match(gene
 
 def test_the_candidate_of_the_largest_weighted_sum_is_chosen():
     measures = np.array([[0.5, 0.1, 0.1, 0.5], [0.6, 0.1, 0.5, 0.2], [0.5, 0.1, 0.1, 0.5]])
-    assert registration.choose(measures, (0.0, 0.0, 0.0)) == 1
-    assert registration.choose(measures, (0.0, -1.0, 0.0)) == 0  # the first of two equal ones
-    assert registration.choose(measures, (0.0, 0.0, 0.5)) == 0
+    assert choice.choose(measures, (0.0, 0.0, 0.0)) == 1
+    assert choice.choose(measures, (0.0, -1.0, 0.0)) == 0  # the first of two equal ones
+    assert choice.choose(measures, (0.0, 0.0, 0.5)) == 0
 
 
 def test_a_transform_that_is_nearly_an_earlier_one_is_dropped():
@@ -678,20 +700,20 @@ def test_a_transform_that_is_nearly_an_earlier_one_is_dropped():
         return rigid.to_homogeneous(rotation, np.array([shift, 0, 0]))
 
     transforms = np.stack([turned(0), turned(3), turned(90), turned(90, 0.2), turned(92, 0.2)])
-    np.testing.assert_array_equal(registration.distinct(transforms), transforms[[0, 2, 3]])
-    np.testing.assert_array_equal(registration.distinct(transforms[:1]), transforms[:1])
+    np.testing.assert_array_equal(choice.distinct(transforms), transforms[[0, 2, 3]])
+    np.testing.assert_array_equal(choice.distinct(transforms[:1]), transforms[:1])
 
 
 def test_the_choice_is_by_agreement_coherence_unmatched_loss_and_support(pair):
     """Of the truth and a half turn, put first, the truth wins, and by each measure's own weight."""
     _, source, target, truth = pair
-    (x, y), scale, subsamples, scorer = registration.prepare_clouds(source, target, 0)
+    (x, y), scale, subsamples, scorer = preparation.prepare_clouds(source, target, 0)
     hypotheses = NetworkHypotheses(load_model())(*subsamples, 0)
     rotation = truth[:3, :3]
     shift = scale * (rotation @ x.centre + truth[:3, 3] - y.centre)
     transforms = np.stack([rigid.to_homogeneous(rotation, shift)] * 2)
     transforms[0, :3, :3] @= np.diag([-1.0, -1.0, 1.0])
-    wrong, right = registration.measure(transforms, hypotheses, subsamples, scorer)
-    better = np.sign([1.0, *registration.CHOICE_WEIGHTS]) * (right - wrong)
+    wrong, right = choice.measure(transforms, hypotheses, subsamples, scorer)
+    better = np.sign([1.0, *choice.CHOICE_WEIGHTS]) * (right - wrong)
     assert (better[[0, 2, 3]] > 0).all()
-    assert registration.choose(np.stack([wrong, right]), registration.CHOICE_WEIGHTS) == 1
+    assert choice.choose(np.stack([wrong, right]), choice.CHOICE_WEIGHTS) == 1

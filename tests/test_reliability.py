@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import lightning as L
 import pytest
 import torch
 from conftest import ROOT
@@ -15,7 +16,8 @@ from test_experiment import load, press_ctrl_c, train
 
 from corrmat.cli import main
 from corrmat.errors import CorrmatError
-from corrmat.training import experiment
+from corrmat.training import experiment, fit
+from corrmat.training.callbacks import MovableCheckpoint
 
 STEPS = ("--trainer.max_steps", "60")  # long enough to be killed in between
 
@@ -119,6 +121,29 @@ def test_kill_9_at_any_moment(tmp_path, whole):
     assert all(torch.equal(ours[key], theirs[key]) for key in theirs)
 
 
+def test_a_run_that_was_moved_still_knows_its_best_weights(tmp_path):
+    """Lightning forgets their score with the folder, and any later weights would replace them."""
+    best = MovableCheckpoint(tmp_path / "then", "best", monitor="val/error")
+    file = str(tmp_path / "then" / "best.ckpt")
+    best.best_model_path = best.kth_best_model_path = file
+    best.best_model_score = best.kth_value = torch.tensor(1.5)
+    best.best_k_models = {file: best.best_model_score}
+    moved = MovableCheckpoint(tmp_path / "now", "best", monitor="val/error")
+    moved.load_state_dict(best.state_dict())
+    assert moved.best_model_path == str(tmp_path / "now" / "best.ckpt")
+    assert moved.best_k_models == {moved.best_model_path: 1.5}
+    assert not moved.check_monitor_top_k(L.Trainer(logger=False), torch.tensor(2.0))
+    assert moved.check_monitor_top_k(L.Trainer(logger=False), torch.tensor(1.0))
+
+
+def test_a_resumed_run_names_every_commit_of_its_code(tmp_path, monkeypatch):
+    monkeypatch.setattr(fit, "commit", lambda: "before")
+    settings = load("1.1", *STEPS).arms["DCP_corr"]
+    interrupted(tmp_path / "arm", settings)
+    monkeypatch.setattr(fit, "commit", lambda: "after")
+    assert train(settings, tmp_path / "arm").commit == "before / after"
+
+
 def test_sigterm_saves_and_says_how_to_go_on(tmp_path):
     config = str(ROOT / "configs/exp/1.1.yaml")
     process = start(tmp_path, "fit", "--config", config, "--arm", "DCP_corr",
@@ -220,10 +245,13 @@ def test_a_record_that_cannot_be_finished_leaves_whole_files(tmp_path, monkeypat
     assert "lr: 0.002" in files()["config.yaml"].decode()
 
 
-def test_a_reader_that_leaves_early_gets_no_traceback():
+@pytest.mark.parametrize("words", [["run", "--help"], ["completion", "bash"], []])
+def test_a_reader_that_leaves_early_gets_no_traceback(words):
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"}
     process = subprocess.Popen(
-        command("run", "--help"), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+        [sys.executable, "-m", "corrmat", *words], env=environment, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
     process.stdout.close()
     assert process.stderr.read() == ""
     assert process.wait() == 0

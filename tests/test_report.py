@@ -1,14 +1,16 @@
 import json
 import re
+import shutil
 import subprocess
 from types import SimpleNamespace
 
 import pytest
 from conftest import ROOT
+from matplotlib.figure import Figure
 
 from corrmat.errors import CorrmatError
 from corrmat.reporting import documents, figures, matrices, overview, tables, writer
-from corrmat.reporting.record import Record
+from corrmat.reporting.record import Record, read_records
 
 RECORD = {
     "id": "9.9",
@@ -217,6 +219,21 @@ def test_the_overview_has_a_panel_for_the_longest_training_of_each_experiment(
     with pytest.raises(CorrmatError, match="no record to draw"):
         overview.draw_overview([])
     assert overview._curve_points(records[0].arms["DCP"])[0][-1] >= 8000
+
+
+def test_a_grid_of_panels_has_no_empty_axes(monkeypatch, committed):
+    grids = []
+    save = Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda f, *a, **k: (grids.append(f), save(f, *a, **k)))
+    overview.draw_overview(overview.longest_records(committed.records)[:9])
+    (figure,) = grids
+    assert [axes.axison for axes in figure.axes] == [True] * 9 + [False] * 3
+
+
+def test_a_record_that_is_half_written_is_none(tmp_path):
+    shutil.copytree(ROOT / "results/laptop/shapes/1.3", tmp_path / "laptop/shapes/1.3")
+    shutil.copytree(ROOT / "results/laptop/shapes/1.3", tmp_path / "laptop/shapes/.1.3.partial")
+    assert len(read_records(tmp_path)) == 1
 
 
 def test_the_matrices_of_the_shipped_arms_are_drawn(tmp_path):

@@ -2,12 +2,13 @@
 
 import io
 import os
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import trimesh
 from PIL import Image
-from plyfile import PlyData, PlyElement
+from plyfile import PlyData, PlyElement, PlyHeaderParseError
 
 from corrmat.data.scans import CLOUDS, MESHES, read_scan, write_moved, write_ply
 from corrmat.errors import CorrmatError
@@ -295,6 +296,19 @@ def test_a_moved_ply_keeps_all_that_it_holds(tmp_path):
     assert (moved["vertex"]["red"] == np.arange(40)).all()
     assert [row.tolist() for row in moved["face"]["vertex_indices"]] == [[0, 1, 2], [3, 4, 5, 6]]
     assert moved.comments == ["TextureFile a.png"]
+
+
+def test_a_ply_that_plyfile_refuses_is_moved_as_its_mesh(tmp_path, monkeypatch):
+    trimesh.creation.box((2, 4, 6)).export(tmp_path / "box.ply", encoding="ascii")
+    text = (tmp_path / "box.ply").read_text()
+    (tmp_path / "box.ply").write_text(text.replace("ascii 1.0", "ascii 1.0  ", 1))
+    for refuses in (False, True):
+        with monkeypatch.context() as patch:
+            if refuses:
+                error = PlyHeaderParseError("a header that only others read")
+                patch.setattr(PlyData, "read", Mock(side_effect=error))
+            write_moved(tmp_path / "moved.ply", tmp_path / "box.ply", TURN)
+        assert trimesh.load(tmp_path / "moved.ply").volume == pytest.approx(48)
 
 
 def test_a_moved_mesh_keeps_its_faces_and_a_cloud_its_points(tmp_path):

@@ -6,6 +6,7 @@ import torch
 
 from corrmat import load_model, weights
 from corrmat.calibration import shipped_calibration
+from corrmat.errors import CorrmatError
 from corrmat.methods import InvariantCorr
 from corrmat.registration import shipping
 
@@ -38,7 +39,7 @@ def package(tmp_path, monkeypatch):
 
 def test_a_checkpoint_becomes_the_weights_of_the_package(checkpoint, package, tmp_path, capsys):
     before = int(weights.shipped_metadata()["pairs"])
-    shipping.ship(checkpoint, FACTS, tmp_path / "results")
+    shipping.ship(checkpoint, FACTS, tmp_path / "results", start="corrmat", seed=7)
     assert package.name in capsys.readouterr().out
     header = weights.shipped_metadata()
     assert header["method"] == "Invariant_corr"
@@ -71,9 +72,17 @@ def test_nothing_is_shipped_before_its_calibration_is_done(checkpoint, package, 
 
     monkeypatch.setattr(shipping, "calibrate", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        shipping.ship(checkpoint, FACTS, package.parent / "results")
+        shipping.ship(checkpoint, FACTS, package.parent / "results", start="corrmat", seed=7)
     assert package.read_bytes() == before
     assert [path.name for path in package.parent.iterdir()] == [package.name]
+
+
+def test_weights_that_start_from_others_have_only_their_own_pairs(checkpoint, package, tmp_path):
+    shipping.ship(checkpoint, FACTS, tmp_path / "results", start=None, seed=7)
+    assert int(weights.shipped_metadata()["pairs"]) == 400
+    shipping.refuse_used_seed(tmp_path / "results", 8)
+    with pytest.raises(CorrmatError, match="trained with seed 7"):
+        shipping.refuse_used_seed(tmp_path / "results", 7)
 
 
 def test_a_shape_gives_one_held_out_pair_at_most():

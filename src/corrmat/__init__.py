@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from corrmat.errors import CorrmatError
     from corrmat.ops.correspondence import SoftCorrespondence
     from corrmat.registration.pose_graph import ScanPose, register_scans
-    from corrmat.registration.register import Registration, register
+    from corrmat.registration.register import register
+    from corrmat.registration.result import Registration
     from corrmat.types import PairBatch, Prediction
     from corrmat.weights import export_model, load_model, load_reference, shipped_models
 
@@ -47,7 +48,7 @@ _MODULES = {
     "PairSettings": "corrmat.data.pairs",
     "Prediction": "corrmat.types",
     "RegistrationDataModule": "corrmat.data.datamodule",
-    "Registration": "corrmat.registration.register",
+    "Registration": "corrmat.registration.result",
     "ScanPose": "corrmat.registration.pose_graph",
     "SoftCorrespondence": "corrmat.ops.correspondence",
     "export_model": "corrmat.weights",

@@ -84,20 +84,22 @@ def train_weights() -> None:
 
     def run() -> int:
         words = ["fit", "--config", str(_config_folder() / "weights.yaml"), *sys.argv[1:]]
-        _run_command(words)
         options = parse(words)
-        from corrmat.registration.shipping import ship
+        from corrmat.registration import shipping
         from corrmat.training import hardware, recipe, runs
-
-        if not hardware.is_first_process():
-            return 0
 
         loaded = recipe.load(options.config, options.scale, options.overrides)
         shipped = recipe.load(_config_folder() / "weights.yaml", "laptop")
-        if (loaded.id, loaded.scale, loaded.data) == (shipped.id, "laptop", shipped.data):
-            folder = options.runs / loaded.place / loaded.treatment
-            results = _config_folder().parent / "results"
-            ship(folder / "last.ckpt", runs.trained_facts(folder), results)
+        ships = (loaded.id, loaded.scale, loaded.data) == (shipped.id, "laptop", shipped.data)
+        arm = loaded.arms[loaded.treatment]
+        results = _config_folder().parent / "results"
+        if ships and arm.start == "corrmat":
+            shipping.refuse_used_seed(results, arm.seed)
+        _run_command(words)
+        if ships and hardware.is_first_process():
+            folder = options.runs / loaded.place / arm.name
+            facts = runs.trained_facts(folder)
+            shipping.ship(folder / "last.ckpt", facts, results, start=arm.start, seed=arm.seed)
             runs.mark_recorded(folder)  # the next run starts from these weights
         return 0
 
@@ -107,7 +109,9 @@ def train_weights() -> None:
 def _exit_code(run: Callable[[], int]) -> int:
     """Call a function; turn what went wrong into a line and an exit code."""
     try:
-        return run()
+        code = run()
+        sys.stdout.flush()  # here a closed pipe can be dealt with
+        return code
     except CorrmatError as error:
         print(f"corrmat: error: {error}", file=sys.stderr)
         return 2
@@ -222,7 +226,11 @@ def _compare(options: Namespace) -> int:
     """Compare models on the frozen pairs of a protocol."""
     from corrmat.files import ensure_writable
     from corrmat.registration import benchmark
+    from corrmat.revision import commit
 
+    models = [name.strip() for name in options.models.split(",") if name.strip()]
+    if not models:
+        raise CorrmatError("which models? e.g. corrmat compare corrmat,icp")
     if options.record is not None:
         _refuse_folder(options.record)
         ensure_writable(options.record.parent)
@@ -231,15 +239,16 @@ def _compare(options: Namespace) -> int:
         if options.data != "shapes" or options.root:
             raise CorrmatError("rooms are procedural: --data and --root go with other protocols")
         about["data"] = "procedural"
+    code = commit()
     pairs = benchmark.frozen_pairs(**about, root=options.root, count=options.pairs)
-    results = benchmark.compare(
-        pairs, [name.strip() for name in options.models.split(",") if name.strip()]
-    )
+    results = benchmark.compare(pairs, models)
     fewer = f", one of each shape: {options.pairs} were asked for"
     print(f"{len(pairs)} pairs{fewer if len(pairs) < options.pairs else ''}")
     print(benchmark.to_table(results))
     if options.record is not None:
-        benchmark.write_results(options.record, results, about | {"pairs": len(pairs)})
+        benchmark.write_results(
+            options.record, results, about | {"pairs": len(pairs), "commit": code}
+        )
         print(f"record: {options.record}")
     return 0
 
@@ -299,7 +308,8 @@ def _register_pair(options: Namespace) -> int:
 
     names = str(options.source[0]), str(options.target)
     source, target = (read_scan(name, options.seed) for name in names)
-    from corrmat.registration.register import register, to_json, to_text
+    from corrmat.registration.register import register
+    from corrmat.registration.result import to_json, to_text
 
     registration = register(
         source, target, model=options.model, refine=options.refine, seed=options.seed

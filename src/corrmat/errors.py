@@ -10,6 +10,10 @@ class CorrmatError(Exception):
     """User input cannot be used. The message names the input and says what to do."""
 
 
+class DivergedError(CorrmatError):
+    """A training loss is not finite."""
+
+
 def short_message(error: Exception) -> str:
     """Return the first two lines of an error of a library as one line, types in plain words."""
     lines = [line.strip(" -") for line in str(error).splitlines() if line.strip(" -")]

@@ -8,7 +8,7 @@ import torch
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
 
-from corrmat.errors import CorrmatError, check_choices
+from corrmat.errors import CorrmatError, DivergedError, check_choices
 from corrmat.metrics import RegistrationMetrics, match_accuracy
 from corrmat.types import PairBatch, Prediction
 
@@ -78,7 +78,7 @@ class RegistrationModule(L.LightningModule):
         """Compute the loss of a batch; log it and the correct matches where Lightning logs.
 
         Raises:
-            CorrmatError: the loss is not finite. A GPU has to be waited for to know this, so that
+            DivergedError: the loss is not finite. A GPU has to be waited for to know this, so that
                 it is only asked at the steps that are logged, and before each validation.
         """
         prediction = self(batch.source, batch.target)
@@ -102,7 +102,7 @@ class RegistrationModule(L.LightningModule):
     def _require_finite_loss(self, where: str) -> None:
         """Reject a last loss that is not finite."""
         if self._last_loss is not None and not torch.isfinite(self._last_loss):
-            raise CorrmatError(
+            raise DivergedError(
                 f"the loss is {self._last_loss.item()} at step {self.global_step} (epoch "
                 f"{self.current_epoch}, {where}); lower --optimizer.lr or clip gradients"
             )

@@ -69,7 +69,7 @@ COMPARE_EPILOG = """examples:
 
 protocols:
   real    two scans of one shape: no shared point, noise, outliers, normals estimated, and
-          either cloud without 30 % of its points
+          each cloud without 30 % of its points
   views   what two depth cameras see of one shape, up to 60 degrees apart
   clean   real without crop and outliers
   rooms   fragments of procedural rooms, in metres (--points 20000)

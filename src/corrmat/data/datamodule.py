@@ -269,7 +269,8 @@ class RegistrationDataModule(L.LightningDataModule):
         training = split == "train"
         new_shapes = self.new_shapes and training
         dataset = PairDataset(self.clouds(split), settings, self.seed, split, new_shapes)
-        epoch, batches = self._resume_state.values() if training else (0, 0)
+        start = self._resume_state if training else _START
+        epoch, batches = start["epoch"], start["batches"]
         skip = batches * self.batch_size
         sampler = EpochSampler(len(dataset), self.seed, training, epoch, skip, share)
         return DataLoader(

@@ -3,6 +3,7 @@
 Each reader is imported on first use: together they take longer than a registration.
 """
 
+import contextlib
 import io
 import re
 from collections.abc import Iterable, Sequence
@@ -115,15 +116,27 @@ def write_moved(path: Path, scan: Path, transform: np.ndarray) -> None:
     Raises:
         CorrmatError: there is no folder to write into, or see `read_scan`.
     """
+    import plyfile
+
+    if scan.suffix.lower() == ".ply":
+        with contextlib.suppress(plyfile.PlyParseError):  # a mesh that trimesh reads all the same
+            content = _ply_content(scan)
+            _move_vertices(content["vertex"], transform)
+            content.text, content.byte_order = False, "<"
+            written = io.BytesIO()
+            content.write(written)
+            _replace(path, written.getbuffer())
+            return
+    shape = read_shape(scan)
+    points, faces = (
+        (shape, None) if isinstance(shape, np.ndarray) else (shape.vertices, shape.faces)
+    )
+    write_ply(path, points @ transform[:3, :3].T + transform[:3, 3], faces)
+
+
+def _move_vertices(vertices: "plyfile.PlyElement", transform: np.ndarray) -> None:
+    """Move the vertices of a PLY file and turn their normals; both become doubles."""
     rotation, translation = transform[:3, :3], transform[:3, 3]
-    if scan.suffix.lower() != ".ply":
-        shape = read_shape(scan)
-        is_cloud = isinstance(shape, np.ndarray)
-        points, faces = (shape, None) if is_cloud else (shape.vertices, shape.faces)
-        write_ply(path, points @ rotation.T + translation, faces)
-        return
-    content = _ply_content(scan)
-    vertices = content["vertex"]
     for names, shift in (("xyz", translation), (("nx", "ny", "nz"), 0.0)):
         if fields := _fields(vertices, names):
             moved = _stack(vertices, fields) @ rotation.T + shift
@@ -132,10 +145,6 @@ def write_moved(path: Path, scan: Path, transform: np.ndarray) -> None:
             vertices.data = vertices.data.astype([(p.name, p.dtype()) for p in vertices.properties])
             for field, column in zip(fields, moved.T, strict=True):
                 vertices[field] = column
-    content.text, content.byte_order = False, "<"
-    written = io.BytesIO()
-    content.write(written)
-    _replace(path, written.getbuffer())
 
 
 def write_ply(path: Path, points: np.ndarray, faces: np.ndarray | None = None) -> None:
@@ -205,12 +214,12 @@ def _ply(path: Path) -> "np.ndarray | trimesh.Trimesh":
 
 
 def _ply_content(path: Path) -> "plyfile.PlyData":
-    """Read a PLY file, whose comments may be in any encoding."""
+    """Read a PLY file; its header may have comments in any encoding, and blanks at line ends."""
     import plyfile
 
     header, end, body = path.read_bytes().partition(_END)
-    header = header.decode("ascii", "replace").encode("ascii", "replace")
-    return plyfile.PlyData.read(io.BytesIO(header + end + body))
+    header = re.sub(rb"[ \t]+\n", b"\n", header).decode("ascii", "replace")
+    return plyfile.PlyData.read(io.BytesIO(header.encode("ascii", "replace") + end + body))
 
 
 def _fields(vertices: "plyfile.PlyElement", names: Iterable[str]) -> list[str]:

@@ -108,7 +108,7 @@ class _SoftmaxRows(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, grad_total: Tensor, grad_mean: Tensor):  # type: ignore[override]  # noqa: ANN001, ANN205
-        """Compute the gradients of features, values and last class, slice by slice."""
+        """Compute the gradients of features and last class, slice by slice; values have none."""
         f_x, f_y, values, last, total, mean = ctx.saved_tensors
         # d S_ij = p_ij (g_i + h_i . v_j) with g_i = grad_total_i - h_i . mean_i
         base = grad_total - (grad_mean * mean).sum(2)

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from corrmat.registration.register import Registration
+from corrmat.registration.result import Registration
 from corrmat.registration.scene import build_scene, extent
 from corrmat.reporting.figures import BLUE, GREEN, GREY, RED
 from corrmat.reporting.snapshots import thin
@@ -81,7 +81,7 @@ def _frames(
 def _title(registration: Registration, share: float, lines: int) -> str:
     """Say what a frame shows: `lines` matches, and the source after a share of its way."""
     if lines:
-        return f"{lines} of the matches; green ones agree with the motion"
+        return f"the {lines} strongest matches; green ones agree with the motion"
     if share == 0:
         return "source (orange) and target (blue)"
     if share < 1:

@@ -19,7 +19,6 @@ from corrmat.errors import CorrmatError
 from corrmat.files import replace_text
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG, rotation_error_deg
 from corrmat.registration.register import register
-from corrmat.revision import commit
 from corrmat.types import PairBatch
 
 Protocol = Literal["paper", "real", "views", "clean", "rooms"]
@@ -162,11 +161,17 @@ def summarise(pairs: PairBatch, outcomes: Sequence[Outcome]) -> ModelResult:
 def write_results(
     path: Path, results: Mapping[str, ModelResult], about: Mapping[str, object]
 ) -> None:
-    """Write the record of a comparison, with what it was made on."""
+    """Write the record of a comparison.
+
+    Args:
+        path: of the JSON file.
+        results: by model.
+        about: the pairs, and the commit of the code that registered them.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     models = {name: asdict(result) for name, result in results.items()}
     hardware = {"threads": torch.get_num_threads(), "cpu": torch.backends.cpu.get_cpu_capability()}
-    content = {**about, "commit": commit(), "hardware": hardware, "models": models}
+    content = {**about, "hardware": hardware, "models": models}
     replace_text(path, json.dumps(content, indent=1) + "\n")
 
 

@@ -14,7 +14,7 @@ from corrmat.ops import rigid
 
 SHAPE = 25  # of the test split: a piano
 MILLIMETRES = 250.0  # its radius
-KEEP = 0.8  # of the points of either scan
+KEEP = 0.8  # of the points of each scan
 NOISE = 0.005  # of the radius
 
 

@@ -152,7 +152,8 @@ class NetworkHypotheses:
         Returns:
             Its own transform (1, 4, 4), and the correspondence matrix; None without any.
         """
-        least = int(getattr(self.network, "min_points", 3))
+        of_method = getattr(self.network, "network", self.network)
+        least = int(getattr(of_method, "min_points", 3))
         if min(x.shape[1], y.shape[1]) < least:
             raise CorrmatError(f"this network needs clouds of at least {least} points")
         parameter = next(self.network.parameters(), x)  # where and in which precision it computes

@@ -14,7 +14,9 @@ from torch import nn
 from corrmat.calibration import verdict
 from corrmat.errors import CorrmatError
 from corrmat.ops import rigid
-from corrmat.registration.register import Cloud, Refine, matrix_lines, register
+from corrmat.registration.preparation import Cloud
+from corrmat.registration.register import Refine, register
+from corrmat.registration.result import matrix_lines
 
 _SWEEPS = 50  # of averaging; poses settle within ten
 # How far a registration may be off the poses to agree with them: in degrees, and as a share of the

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from corrmat.registration.register import Registration, is_near
+from corrmat.registration.preparation import is_near
+from corrmat.registration.result import Registration
 from corrmat.reporting.figures import principal_axes
 
 BESIDE = 0.6  # of both clouds' largest extents: how far the source starts from the target

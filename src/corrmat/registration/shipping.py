@@ -14,6 +14,7 @@ from corrmat import weights
 from corrmat.calibration import SURE, Calibration
 from corrmat.data.datamodule import RegistrationDataModule
 from corrmat.data.pairs import STREAM, Key, make_pairs
+from corrmat.errors import CorrmatError
 from corrmat.files import ensure_writable, replace_text
 from corrmat.metrics import ADDS_THRESHOLD
 from corrmat.registration import benchmark
@@ -21,10 +22,13 @@ from corrmat.revision import commit
 from corrmat.types import PairBatch
 
 CALIBRATION_PAIRS = {512: 200, 1024: 100}  # of a protocol, by points of a cloud
+_TRAINING = Path("register", "training.json")  # below results/
 CALIBRATION_PROTOCOLS: tuple[benchmark.Protocol, ...] = ("real", "views", "clean")
 
 
-def ship(checkpoint: Path, facts: Mapping[str, Any], results: Path) -> None:
+def ship(
+    checkpoint: Path, facts: Mapping[str, Any], results: Path, *, start: str | None, seed: int
+) -> None:
     """Calibrate the confidence of a checkpoint and write its weights into the package.
 
     Nothing is written before the calibration is done. Training goes on from the weights that ship,
@@ -34,18 +38,35 @@ def ship(checkpoint: Path, facts: Mapping[str, Any], results: Path) -> None:
         checkpoint: of `corrmat fit`.
         facts: of its run, see `training.runs.trained_facts`.
         results: folder of records.
+        start: the weights that the run started from; "corrmat" for those that ship.
+        seed: of the run.
     """
     ensure_writable(results / "register")
+    shipped_by = commit()
     _, hparams, network = weights.checkpoint_network(checkpoint)
     calibration, recalls = calibrate(str(checkpoint))
-    before = int(weights.shipped_metadata().get("pairs", 0))
+    before = int(weights.shipped_metadata().get("pairs", 0)) if start == "corrmat" else 0
     pairs = before + facts["pairs_seen"]
     path = weights.ship_network(
         "corrmat", "Invariant_corr", hparams, network,
-        commit=str(commit()), calibration=json.dumps(calibration), pairs=str(pairs),
+        commit=str(shipped_by), calibration=json.dumps(calibration), pairs=str(pairs),
     )  # fmt: skip
-    add_training(results, {"before": before, "pairs": pairs, **facts, "validation": recalls})
+    run = {"before": before, "pairs": pairs, "seed": seed, **facts, "validation": recalls}
+    add_training(results, run)
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, trained on {pairs:,} pairs")
+
+
+def refuse_used_seed(results: Path, seed: int) -> None:
+    """Refuse to train on from the shipped weights with a seed that they were trained with.
+
+    Raises:
+        CorrmatError: a run of results/register/training.json has it.
+    """
+    if seed in (run.get("seed") for run in _training_runs(results)):
+        raise CorrmatError(
+            f"the shipped weights have trained with seed {seed}: it would repeat the same shapes; "
+            "give another --seed"
+        )
 
 
 def recalibrate() -> None:
@@ -61,10 +82,14 @@ def recalibrate() -> None:
 
 def add_training(results: Path, run: dict[str, object]) -> None:
     """Add a training run to results/register/training.json."""
-    path = results / "register" / "training.json"
-    runs = json.loads(path.read_text()) if path.is_file() else []
+    path = results / _TRAINING
     path.parent.mkdir(parents=True, exist_ok=True)
-    replace_text(path, json.dumps([*runs, run], indent=1) + "\n")
+    replace_text(path, json.dumps([*_training_runs(results), run], indent=1) + "\n")
+
+
+def _training_runs(results: Path) -> list[dict[str, Any]]:
+    path = results / _TRAINING
+    return json.loads(path.read_text()) if path.is_file() else []
 
 
 def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import plotly.graph_objects as go
 
-from corrmat.registration.register import Registration, matrix_lines
+from corrmat.registration.result import Registration, matrix_lines
 from corrmat.registration.scene import build_scene, extent
 from corrmat.reporting.figures import BLUE, GREEN, GREY, RED
 from corrmat.reporting.html import render

@@ -6,7 +6,7 @@ docs/claims.md has the rule in words, and what of it came later than the records
 import json
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
@@ -24,10 +24,11 @@ from corrmat.reporting.intervals import (
     ratio_of_medians,
     read_errors,
 )
-from corrmat.reporting.record import Record
+from corrmat.reporting.record import ArmResult, Record
 from corrmat.reporting.tables import markdown_head, markdown_row, paper_metric, ratio_cell
 
 Verdict = Literal["confirmed", "confirmed in direction", "not shown", "contradicted"]
+Kind = Literal["registers better", "converges sooner", "other claims"]
 HIGH_RATE_CONTROL = "RPMNet_high_rate"
 LEFT_IDENTITY = 0.5  # of identity's median error: an arm above it has learnt nothing to compare
 NEAR_PAPER = 0.5  # of the paper's ratio: less is a confirmation of the direction only
@@ -49,6 +50,7 @@ class Claim:
     ours: str
     where: str
     verdict: Verdict
+    kind: Kind = "other claims"
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,7 @@ def less_error(evidence: Evidence) -> Claim:
     record = evidence.record
     ratio = ratio_of_medians(evidence.baseline, evidence.treatment)
     learnt = evidence.left_identity(evidence.baseline)
-    theirs = [record.paper[arm].overall(paper_metric(record)) for arm in record.compared]
+    theirs = by_paper_metric(record, record.paper)
     paper_ratio = theirs[0] / theirs[1] if theirs[0] and theirs[1] else None
     p = p_of_equal_errors(evidence.baseline, evidence.treatment)
     flips = evidence.baseline.flipped, evidence.treatment.flipped
@@ -129,7 +131,18 @@ def less_error(evidence: Evidence) -> Claim:
         ours,
         evidence.where,
         verdict_of_ratio(ratio, paper_ratio, learnt),
+        "registers better",
     )
+
+
+def by_paper_metric(record: Record, results: Mapping[str, ArmResult]) -> list[float | None]:
+    """Return METHOD's and METHOD_corr's error as the paper measures it.
+
+    Args:
+        record: whose arms and metric.
+        results: its own arms, or those of the paper.
+    """
+    return [results[arm].overall(paper_metric(record)) for arm in record.compared]
 
 
 def headline(evidence: Evidence) -> list[str]:
@@ -138,15 +151,14 @@ def headline(evidence: Evidence) -> list[str]:
     arms = [as_text(median_rotation(e), "deg") for e in (evidence.baseline, evidence.treatment)]
     judged = less_error(evidence)
     pairs = record.arms[record.treatment].pairs_seen
-    by_paper_metric = [record.arms[a].overall(paper_metric(record)) for a in record.compared]
     ransac = evidence.errors.get("ransac")
     return [
         f"{record.id} {record.family}, {record.title}",
         *arms,
         f"{ransac.median_deg:.2g} deg" if ransac else "",
         as_text(ratio_of_medians(evidence.baseline, evidence.treatment)),
-        ratio_cell(by_paper_metric),
-        judged.paper.rpartition(": ")[2].removesuffix(" times"),
+        ratio_cell(by_paper_metric(record, record.arms)),
+        ratio_cell(by_paper_metric(record, record.paper)),
         f"{pairs:,} pairs, {record.data}",
         f"**{judged.verdict}**",
     ]
@@ -182,6 +194,7 @@ def sooner(evidence: Evidence) -> Claim | None:
         f"{goal_text} of {baseline.pairs_seen:,} pairs: reached {reached}{best_at_high_rate}",
         evidence.where,
         verdict,
+        "converges sooner",
     )
 
 
@@ -375,10 +388,14 @@ def _judge(record: Record, results: Path) -> list[Claim]:
 
 
 def count_verdicts(claims: Sequence[Claim]) -> str:
-    """Say how many verdicts of the ledger are of each kind, and on how many claims."""
-    counts = Counter(claim.verdict for claim in claims)
-    kinds = ", ".join(f"{counts[verdict]} {verdict}" for verdict in get_args(Verdict))
-    return f"{kinds} ({len(claims)} verdicts on {len({claim.words for claim in claims})} claims)"
+    """Say how many verdicts the ledger has, of each kind of claim."""
+    parts = []
+    for kind in get_args(Kind):
+        counts = Counter(claim.verdict for claim in claims if claim.kind == kind)
+        if counts:
+            each = ", ".join(f"{counts[verdict]} {verdict}" for verdict in get_args(Verdict))
+            parts.append(f"*{kind}* ({counts.total()} records): {each}")
+    return "; ".join(parts)
 
 
 def verdicts(record: Record, results: Path) -> str:

@@ -1,6 +1,5 @@
 """Tables of `corrmat compare`'s records: the shipped weights beside the classical pipelines."""
 
-import itertools
 import json
 from pathlib import Path
 
@@ -21,21 +20,21 @@ _KINDS = {"single objects": ("shapes", "modelnet40"), "rooms": ("procedural",)} 
 _BINS = 10  # of the expected calibration error
 
 
-def comparison_summary(results: Path, points: int = 512) -> str:
+def comparison_summary(results: Path) -> str:
     """Build README's table: recall at 5 degrees of every model, ours with its interval."""
-    records = [r for r in _read_comparisons(results) if r["points"] == points]
+    records = [r for r in _read_comparisons(results) if r["protocol"] != "rooms"]
     if not records:
         return "No comparison is recorded; `make protocols` makes them."
     models = list(records[0]["models"])
-    heads = ["pairs", "data", *models]
-    lines = markdown_head(heads)
+    lines = markdown_head(["pairs", "data", "points", *models])
     for record in records:
         cells = []
         for model in models:
             hits = _within_angle(record["models"][model])
             interval = f" ({_wilson(hits)})" if model == OURS else ""
             cells.append(f"{hits.mean():.0%}{interval}")
-        lines.append(markdown_row([record["protocol"], record["data"], *cells]))
+        about = [str(record[name]) for name in ("protocol", "data", "points")]
+        lines.append(markdown_row([*about, *cells]))
     return "\n".join(lines)
 
 
@@ -134,13 +133,12 @@ def choice_table(results: Path) -> str:
 
 
 def confidence_table(results: Path) -> str:
-    """Build the table of what the confidence promised and how often the clouds were aligned.
+    """Build the table of verdicts: what their confidence promised, and what was so.
 
-    Below it stand the expected calibration error and the shares of wrong verdicts, of single
-    objects and of rooms.
+    Below it stands the expected calibration error, of single objects and of rooms.
     """
-    heads = ["data", "confidence", "pairs", "promised", "aligned"]
-    lines, summaries = [markdown_row(heads), "|---|---|---|---|---|"], []
+    heads = ["verdict", "data", "pairs", "promised", "aligned", "wrong"]
+    lines, summaries = markdown_head(heads), []
     comparisons = _read_comparisons(results)
     for what, data_sets in _KINDS.items():
         both = []
@@ -151,29 +149,19 @@ def confidence_table(results: Path) -> str:
             promised = np.concatenate([_confidence(row) for row in rows])
             aligned = np.concatenate([_aligned(row) for row in rows])
             both.append((promised, aligned))
-            for low, high in itertools.pairwise((0, 0.25, 0.5, 0.75, 1.01)):
-                inside = (low <= promised) & (promised < high)
+            verdicts = np.array([verdict(p, "").partition(":")[0] for p in promised])
+            for words in ("aligned", "probably aligned", "doubtful"):
+                inside = verdicts == words
                 if inside.any():
                     means = [f"{values[inside].mean():.0%}" for values in (promised, aligned)]
-                    span = f"{low:.0%} to {min(high, 1):.0%}"
-                    lines.append(markdown_row([data, span, str(inside.sum()), *means]))
+                    counts = [str(number) for number in (inside.sum(), (inside & ~aligned).sum())]
+                    lines.append(markdown_row([words, data, counts[0], *means, counts[1]]))
         if both:
             promised, aligned = map(np.concatenate, zip(*both, strict=True))
-            said = _reliability(promised, aligned)
-            summaries += ["", f"{len(promised)} pairs of {what}: {said}."]
+            error = expected_calibration_error(promised, aligned)
+            text = f"expected calibration error over {_BINS} bins {error:.3f}"
+            summaries += ["", f"{len(promised)} pairs of {what}: {text}."]
     return "\n".join(lines + summaries)
-
-
-def _reliability(promised: np.ndarray, aligned: np.ndarray) -> str:
-    """Say how far promises (n,) were from what happened, and how often a verdict was wrong."""
-    error = expected_calibration_error(promised, aligned)
-    parts = [f"expected calibration error over {_BINS} bins {error:.3f}"]
-    verdicts = np.array([verdict(p, "").partition(":")[0] for p in promised])
-    for words in ("aligned", "probably aligned"):
-        called = verdicts == words
-        wrong = int((called & ~aligned).sum())
-        parts.append(f'{called.sum()} are called "{words}", {wrong} of them wrongly')
-    return ", ".join(parts)
 
 
 def expected_calibration_error(promised: np.ndarray, happened: np.ndarray) -> float:

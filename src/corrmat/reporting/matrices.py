@@ -10,7 +10,7 @@ from corrmat.reporting.figures import to_png
 from corrmat.reporting.record import read_snapshots
 from corrmat.weights import load_model, shipped_metadata, shipped_models
 
-ARMS = ("1.2/DCP", "1.2/DCP_corr")
+LOSSES = {"1.2/DCP": "the transform", "1.2/DCP_corr": "the matrix"}
 
 
 @torch.no_grad()
@@ -26,9 +26,9 @@ def draw_matrices(results: Path) -> bytes | None:
     Returns:
         None where the weights do not ship, or their record is missing.
     """
-    if not set(ARMS) <= set(shipped_models()):
+    if not set(LOSSES) <= set(shipped_models()):
         return None
-    snapshots = read_snapshots(results / shipped_metadata(ARMS[1])["record"])
+    snapshots = read_snapshots(results / shipped_metadata("1.2/DCP_corr")["record"])
     if not snapshots:
         return None
     pair = snapshots[len(snapshots) // 2]
@@ -37,14 +37,14 @@ def draw_matrices(results: Path) -> bytes | None:
     rows = np.argsort(match)
     rest = np.setdiff1d(np.arange(target.shape[1]), match)
     columns = np.concatenate([match[rows], rest])
-    figure = Figure(figsize=(8.2, 3.3), layout="constrained")
-    for axes, model in zip(figure.subplots(1, 2), ARMS, strict=True):
+    figure = Figure(figsize=(8.2, 2.9), layout="constrained")
+    for axes, model in zip(figure.subplots(1, 2), LOSSES, strict=True):
         correspondence = load_model(model)(source, target).correspondence
         prob = correspondence.prob()[0].numpy()[np.ix_(rows, columns)]
         correct = (correspondence.argmax()[0].numpy() == match).mean()
-        axes.imshow(prob, cmap="magma", vmin=0, vmax=prob.max())
+        image = axes.imshow(prob, cmap="magma", vmin=0, vmax=prob.max())
+        figure.colorbar(image, ax=axes, label="probability", fraction=0.032)
         name = model.split("/")[1]
-        loss = "the correspondence matrix" if name.endswith("_corr") else "the transform"
-        axes.set_title(f"trained on {loss}: {correct:.0%} right", fontsize="medium")
+        axes.set_title(f"{name}, loss on {LOSSES[model]}: {correct:.0%} right", fontsize="medium")
         axes.set(xlabel="target points", ylabel="source points", xticks=[], yticks=[])
     return to_png(figure)

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, NullFormatter
+from matplotlib.ticker import EngFormatter, LogFormatter, NullLocator
 
 from corrmat.errors import CorrmatError
-from corrmat.reporting.figures import GREY, arm_colours, to_png
+from corrmat.reporting.figures import GREEN, GREY, arm_colours, to_png
 from corrmat.reporting.record import ArmResult, Record, defined
 
 METRIC = "rotation_error_deg_mean"
@@ -46,15 +46,13 @@ def draw_overview(records: Sequence[Record]) -> bytes:
         raise CorrmatError("no record to draw: make exp1.2 writes one (smoke runs are not drawn)")
     rows = -(-len(records) // COLUMNS)
     figure = Figure(figsize=(8.2, 1.95 * rows + 0.5), layout="constrained")
-    panels = figure.subplots(rows, COLUMNS, squeeze=False).flat
+    panels = figure.subplots(rows, COLUMNS, squeeze=False).flatten()
     for axes, record in zip(panels, records, strict=False):
         _draw_panel(axes, record)
-    for axes in list(panels)[len(records) :]:
+    for axes in panels[len(records) :]:
         axes.set_axis_off()
     figure.supylabel("mean rotation error, deg", fontsize="medium")
-    figure.supxlabel(
-        "training pairs seen (1.4 and 2.4: initial misalignment, deg)", fontsize="medium"
-    )
+    figure.supxlabel("training pairs seen", fontsize="medium")
     named = {str(line.get_label()): line for axes in figure.axes for line in axes.lines}
     figure.legend(
         list(named.values()), list(named), loc="outside upper center", ncols=4, fontsize="small"
@@ -70,19 +68,27 @@ def _draw_panel(axes: Axes, record: Record) -> None:
         if not x:
             continue
         role = {record.baseline: "METHOD", record.treatment: "METHOD_corr"}.get(arm, "controls")
-        width = 0.8 if role == "controls" else 1.6
-        axes.plot(x, y, color=colours[arm], linewidth=width, label=role)
+        colour, width = (GREEN, 0.8) if role == "controls" else (colours[arm], 1.6)
+        axes.plot(x, y, color=colour, linewidth=width, label=role)
     identity = record.baselines.get("identity", ArmResult({})).metrics.get(METRIC)
     if identity:
         axes.axhline(identity, color=GREY, linestyle="--", linewidth=1, label="identity guess")
     trained = any(not result.bands for result in record.arms.values())
     if trained:
         axes.set_xscale("log")
-        axes.xaxis.set_minor_formatter(NullFormatter())
+        pairs = [x for result in record.arms.values() for x in _curve_points(result)[0]]
+        axes.set_xticks([min(pairs), max(pairs)] if pairs else [])
+        axes.xaxis.set_minor_locator(NullLocator())
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    else:
+        axes.set_xlabel("initial misalignment, deg", fontsize="x-small")
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter("{x:g}")
-    axes.yaxis.set_minor_formatter(NullFormatter())
+    few = LogFormatter(
+        minor_thresholds=(1.3, 0.6)
+    )  # labels between powers of ten, if there are few
+    axes.yaxis.set_minor_formatter(few)
+    axes.tick_params(which="minor", labelsize="xx-small")
     axes.tick_params(labelsize="x-small")
     axes.grid(alpha=0.3)
     axes.set_title(

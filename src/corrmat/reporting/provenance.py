@@ -46,7 +46,8 @@ def staleness(record: Record, repository: Path) -> str:
         record: with the commits that its arms were trained at.
         repository: a checkout that has these commits.
     """
-    commits = {str(arm.trained_at or record.commit) for arm in record.arms.values()}
+    trained = (str(arm.trained_at or record.commit) for arm in record.arms.values())
+    commits = {commit for each in trained for commit in each.split(" / ")}
     if any(name == "None" or name.endswith("+") for name in commits):
         return "trained with uncommitted code"
     code = [f"src/{path}" for path in code_of(record.family, record.arms)]

@@ -182,7 +182,8 @@ def read_record(path: Path) -> Record:
 
 def read_records(results: Path) -> list[Record]:
     """Read every record below a folder, ordered by scale, experiment, data and seed."""
-    records = [read_record(path) for path in results.glob("*/*/*/metrics.json")]
+    paths = results.glob("*/*/[!.]*/metrics.json")  # not those of a record that is half written
+    records = [read_record(path) for path in paths]
     return sorted(records, key=lambda r: (r.scale, r.id, r.data, r.seed))
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import lightning as L
 import torch
-from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
 
@@ -32,6 +32,26 @@ CURVE_METRICS = (
     "translation_rmse",
     "chamfer",
 )
+
+
+class MovableCheckpoint(ModelCheckpoint):
+    """A ModelCheckpoint that still knows the best weights after its folder was moved.
+
+    Lightning's forgets their score then, and the next weights replace them, however bad.
+    """
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take up the state of an interrupted run, its paths changed to today's folder."""
+
+        def here(path: str) -> str:
+            return str(Path(str(self.dirpath)) / Path(path).name) if path else path
+
+        paths = ("best_model_path", "kth_best_model_path", "last_model_path")
+        moved = {name: here(state_dict[name]) for name in paths}
+        best = {here(path): score for path, score in state_dict["best_k_models"].items()}
+        super().load_state_dict(
+            state_dict | moved | {"best_k_models": best, "dirpath": self.dirpath}
+        )
 
 
 class ValidationHistory(Callback):

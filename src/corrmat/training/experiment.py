@@ -170,7 +170,7 @@ def _check_test_pairs(recipe: Recipe, arms: Sequence[Arm]) -> str:
         if arm.datamodule.test_settings != first.test_settings:
             raise CorrmatError(
                 f"{arms[0].name} and {arm.name} would be tested on different pairs: their data may "
-                "differ in batch_size, train_shapes and stretch only"
+                "differ in what training alone uses (batch_size, train_shapes, stretch, ...)"
             )
     for share in recipe.sweep_outliers:
         replace(first.pairs, outliers=share)  # which checks it

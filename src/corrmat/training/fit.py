@@ -9,16 +9,20 @@ from pathlib import Path
 
 import lightning as L
 import torch
-from lightning.pytorch.callbacks import ModelCheckpoint
 from torch import Tensor
 
 from corrmat.data.datamodule import PairDataset
-from corrmat.errors import CorrmatError, short_message
+from corrmat.errors import CorrmatError, DivergedError, short_message
 from corrmat.methods import Method
 from corrmat.module import RegistrationModule
 from corrmat.revision import commit
 from corrmat.training import loggers, runs
-from corrmat.training.callbacks import PerPairCollector, SaveOnInterrupt, ValidationHistory
+from corrmat.training.callbacks import (
+    MovableCheckpoint,
+    PerPairCollector,
+    SaveOnInterrupt,
+    ValidationHistory,
+)
 from corrmat.training.console import Board, BoardProgress
 from corrmat.training.hardware import (
     describe_hardware,
@@ -59,10 +63,11 @@ def train(
         fresh: start anew in any case.
 
     Raises:
-        CorrmatError: a loss that is not finite; a full disk.
+        DivergedError: a loss that is not finite.
+        CorrmatError: a full disk.
         KeyboardInterrupt: Ctrl-C in the last step; the arm is trained.
     """
-    trained_at = commit()
+    today = commit()
     method = fresh_method(arm.settings)
     resume_from = None if fresh else runs.find_interrupted(folder, arm)
     if resume_from is None:
@@ -71,15 +76,15 @@ def train(
     if is_first_process():
         if resume_from is None:
             runs.set_aside(folder, arm)
-        runs.start_run(folder, arm)
+        runs.start_run(folder, arm, today)
     else:
         logger, board = "none", None
 
     history, interrupt = ValidationHistory(), SaveOnInterrupt(folder / "last.ckpt")
     callbacks = [
         history,
-        ModelCheckpoint(folder, "best", monitor=MONITOR, enable_version_counter=False),
-        ModelCheckpoint(folder, "last", enable_version_counter=False),
+        MovableCheckpoint(folder, "best", monitor=MONITOR, enable_version_counter=False),
+        MovableCheckpoint(folder, "last", enable_version_counter=False),
         interrupt,
         *([BoardProgress(board, arm.name, history)] if board else []),
     ]
@@ -102,16 +107,15 @@ def train(
     except (CorrmatError, OSError) as error:
         last = folder / "last.ckpt"
         kept = last if last.is_file() else "none yet"
-        raise CorrmatError(
-            f"{error}; seed {arm.settings.seed}; last good checkpoint: {kept}"
-        ) from error
+        kind = DivergedError if isinstance(error, DivergedError) else CorrmatError
+        raise kind(f"{error}; seed {arm.settings.seed}; last good checkpoint: {kept}") from error
     loggers.finish_loggers(lightning_loggers)
     best = folder / "best.ckpt"
     if not best.is_file():
         log.info("training ended before the first validation: the last weights count as the best")
         trainer.save_checkpoint(best)
     trained = TrainedArm(
-        best, history.pairs_seen, history.seconds, trained_at, history.points,
+        best, history.pairs_seen, history.seconds, runs.commits_of(folder), history.points,
         describe_hardware(arm.settings),
     )  # fmt: skip
     if is_first_process():

@@ -67,12 +67,16 @@ def build_method(settings: ArmSettings) -> Method:
     """Build the method of these settings, freshly initialised.
 
     Raises:
-        CorrmatError: the network or loss cannot be built with these options.
+        CorrmatError: the network or loss cannot be built with these options. Whatever a network
+            of the user's own raises is not reworded.
     """
     network, loss = settings.network.as_dict(), settings.loss.as_dict()
+    method = METHODS[settings.method]
     try:
-        return METHODS[settings.method](network, loss, settings.optimizer)
+        return method(network, loss, settings.optimizer)
     except (ValueError, RuntimeError, ArithmeticError) as error:
+        if not method.network_type.__module__.startswith("corrmat."):
+            raise
         raise CorrmatError(
             f"cannot build {settings.method} from the --network options: {error}"
         ) from error

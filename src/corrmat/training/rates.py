@@ -6,10 +6,10 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
-from corrmat.errors import CorrmatError
+from corrmat.errors import CorrmatError, DivergedError
 from corrmat.files import ensure_writable, replace_text
+from corrmat.reporting.record import defined
+from corrmat.revision import commit
 from corrmat.training import loggers
 from corrmat.training.console import Board
 from corrmat.training.experiment import train_or_reuse
@@ -29,9 +29,9 @@ class RateResult:
     """How one learning rate did; keys of the record's JSON."""
 
     lr: float
-    rotation_error_deg_mean: float  # on validation, when the short training ends
-    loss: float
-    pairs_seen: int
+    rotation_error_deg_mean: float | None  # on validation, at the end; None if it diverged
+    loss: float | None
+    pairs_seen: int | None
     commit: str | None  # of the code that trained it
 
 
@@ -76,14 +76,16 @@ def sweep(
             for factor in FACTORS:
                 arm = prepare(_short(settings, factor))
                 log.info(f"\n{recipe.id} {arm.name}")
-                trained = train_or_reuse(place, arm, runs_folder, logger, board, fresh=fresh)
+                lr = arm.settings.optimizer.lr
+                try:
+                    trained = train_or_reuse(place, arm, runs_folder, logger, board, fresh=fresh)
+                except DivergedError as diverged:
+                    log.info(str(diverged))
+                    swept[name].append(RateResult(lr, None, None, None, commit()))
+                    continue
                 last = trained.curve[-1]
-                swept[name].append(
-                    RateResult(
-                        arm.settings.optimizer.lr, last[_METRIC], last["loss"],
-                        trained.pairs_seen, trained.commit,
-                    )
-                )  # fmt: skip
+                error, loss = defined(last[_METRIC]), defined(last["loss"])
+                swept[name].append(RateResult(lr, error, loss, trained.pairs_seen, trained.commit))
     content = {
         "id": recipe.id,
         "scale": recipe.scale,
@@ -99,9 +101,16 @@ def sweep(
 
 
 def chosen(rates: list[RateResult]) -> float:
-    """Return the rate with the lowest rotation error on validation; NaN is the highest."""
-    errors = np.array([rate.rotation_error_deg_mean for rate in rates])
-    return rates[int(np.nan_to_num(errors, nan=np.inf).argmin())].lr
+    """Return the rate with the lowest rotation error on validation.
+
+    Raises:
+        CorrmatError: training diverged at every rate.
+    """
+    errors = {r.lr: r.rotation_error_deg_mean for r in rates}
+    finite = {lr: error for lr, error in errors.items() if error is not None}
+    if not finite:
+        raise CorrmatError(f"training diverged at every rate: {', '.join(map(str, errors))}")
+    return min(finite, key=finite.__getitem__)
 
 
 def _short(settings: ArmSettings, factor: float) -> ArmSettings:

@@ -40,7 +40,9 @@ _NOT_TRAINER: set[str | int] = {  # set by this project
     "plugins", "profiler", "model_registry", "use_distributed_sampler", "precision",
 }  # fmt: skip
 # Options of the data that do not change its test pairs.
-_NOT_TEST_PAIRS = {"data", "root", "name", "batch_size", "num_workers", "train_shapes", "stretch"}
+_NOT_TEST_PAIRS = {
+    "data", "root", "name", "batch_size", "num_workers", "train_shapes", "stretch", "new_shapes",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -5,21 +5,25 @@ import json
 import logging
 import pickle
 import shutil
-from collections.abc import Iterator
+import zlib
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
 import torch
 import yaml
+from torch import Tensor
 
 from corrmat.files import replace_text
 from corrmat.training.preflight import Arm
 from corrmat.training.recipe import Recipe, Settings, default_settings, merge
+from corrmat.weights import load_model
 
 log = logging.getLogger("corrmat")
 _TRAINED = "trained.json"
 _SETTINGS = "settings.yaml"
+_COMMITS = "commits.txt"  # of the code, one for each time that the run was started or resumed
 _RECORDED = "recorded"  # marks an arm whose record is written: the next run trains anew
 
 
@@ -42,13 +46,24 @@ def arm_folders(recipe: Recipe, arm: str, runs: Path) -> list[Path]:
 
 
 def training_settings(arm: Arm) -> str:
-    """Return what decides how an arm is trained, as YAML: settings and a checksum of the shapes.
+    """Return what decides how an arm is trained, as YAML.
 
-    The data's folder, the number of workers and the number of test shapes do not count.
+    Settings, and checksums of the shapes and of the weights that it starts from. The data's
+    folder, the number of workers and the number of test shapes do not count.
     """
     settings = _that_count(arm.settings.as_plain())
-    checksum = {"data": {"checksum": arm.datamodule.clouds("train").checksum()}}
-    return yaml.safe_dump(merge(settings, checksum), sort_keys=False)
+    checksums: Settings = {"data": {"checksum": arm.datamodule.clouds("train").checksum()}}
+    if arm.settings.start is not None:
+        checksums["start_checksum"] = _checksum(load_model(arm.settings.start).state_dict())
+    return yaml.safe_dump(merge(settings, checksums), sort_keys=False)
+
+
+def _checksum(state: Mapping[str, Tensor]) -> str:
+    """Compute the CRC-32 of a network's tensors."""
+    value = 0
+    for tensor in state.values():
+        value = zlib.crc32(tensor.cpu().contiguous().numpy().tobytes(), value)
+    return f"{value:08x}"
 
 
 def _that_count(settings: Settings) -> Settings:
@@ -91,10 +106,22 @@ def _may_replace(folder: Path, kept: Path) -> bool:
     return same and ((folder / _RECORDED).exists() or not (kept / _RECORDED).exists())
 
 
-def start_run(folder: Path, arm: Arm) -> None:
-    """Create a run's folder and write its settings."""
+def start_run(folder: Path, arm: Arm, commit: str | None) -> None:
+    """Create a run's folder, or go on in it: write its settings and add the code's commit."""
     folder.mkdir(parents=True, exist_ok=True)
     replace_text(folder / _SETTINGS, training_settings(arm))
+    commits = [*_commits(folder), *([commit] if commit else [])]
+    replace_text(folder / _COMMITS, "".join(f"{each}\n" for each in dict.fromkeys(commits)))
+
+
+def commits_of(folder: Path) -> str | None:
+    """Return the commits of the code that trained a run, e.g. "9d7c4941ea0b / a0ddfb6c5d12"."""
+    return " / ".join(_commits(folder)) or None
+
+
+def _commits(folder: Path) -> list[str]:
+    file = folder / _COMMITS
+    return file.read_text().splitlines() if file.is_file() else []
 
 
 def finish_run(folder: Path, trained: TrainedArm) -> None:
@@ -125,7 +152,9 @@ def find_trained(recipe: Recipe, arm: Arm, runs: Path) -> TrainedArm | None:
     for folder in (*([] if (main / _RECORDED).exists() else [main]), *others):
         if (folder / _TRAINED).is_file() and _same_settings(folder, arm):
             content = json.loads((folder / _TRAINED).read_text())
-            return TrainedArm(**content | {"checkpoint": folder / content["checkpoint"]})
+            checkpoint = folder / content["checkpoint"]
+            if checkpoint.is_file():
+                return TrainedArm(**content | {"checkpoint": checkpoint})
     return None
 
 

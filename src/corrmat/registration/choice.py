@@ -1,0 +1,97 @@
+"""The choice among a model's candidates, and the refinement of the chosen one."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from corrmat.registration.em_icp import WIDTHS, em_icp
+from corrmat.registration.hypotheses import Hypotheses
+from corrmat.registration.preparation import MODEL_POINTS
+from corrmat.registration.scoring import AlignmentScorer
+
+
+class ChoiceWeights(NamedTuple):
+    """A candidate scores its agreement + these times what the fields name."""
+
+    coherence: float
+    unmatched_loss: float
+    support: float
+
+
+CHOICE_WEIGHTS = ChoiceWeights(4.0, -1.0, 0.2)  # benchmarks/choice.py
+WITHOUT_MATCHABILITIES = ChoiceWeights(1.5, 0.0, 0.0)  # for models that have none
+SAME_TRANSFORM = 0.1  # difference of two matrices: a turn by 4 degrees, or a shift by 0.1
+COARSE_POINTS = 400  # of each cloud, for EM-ICP's first pass
+FINE_ITERATIONS = 4  # of its second pass, on all points of a model with matches
+
+
+def distinct(transforms: np.ndarray) -> np.ndarray:
+    """Drop each transform that is nearly an earlier one: (T, 4, 4) to (D, 4, 4)."""
+    kept = transforms[:1]
+    for transform in transforms[1:]:
+        if np.linalg.norm(kept - transform, axis=(1, 2)).min() > SAME_TRANSFORM:
+            kept = np.concatenate([kept, transform[None]])
+    return kept
+
+
+def measure(
+    transforms: np.ndarray,
+    hypotheses: Hypotheses,
+    subsamples: tuple[np.ndarray, np.ndarray],
+    scorer: AlignmentScorer,
+) -> np.ndarray:
+    """Measure what the choice among transforms weighs.
+
+    Args:
+        transforms: (T, 4, 4).
+        hypotheses: of the model.
+        subsamples: the clouds that they were made from.
+        scorer: of the clouds to measure the transforms on; their first points are the model's.
+
+    Returns:
+        (T, 4): agreement, coherence, unmatched loss, support.
+    """
+    rows = []
+    for transform in transforms:
+        agreement, coherence, distances = scorer.alignment(transform)
+        support = hypotheses.support(transform, *subsamples)
+        rows.append((agreement, coherence, hypotheses.unmatched_loss(distances), support))
+    return np.array(rows)
+
+
+def choose(measures: np.ndarray, weights: ChoiceWeights) -> int:
+    """Choose the candidate of the highest score.
+
+    Args:
+        measures: (T, 4) of `measure`.
+        weights: of coherence, unmatched loss and support, beside agreement's 1.
+    """
+    return int(np.argmax(measures @ [1.0, *weights]))
+
+
+def refine_chosen(
+    transform: np.ndarray,
+    hypotheses: Hypotheses,
+    subsamples: tuple[np.ndarray, np.ndarray],
+    full: AlignmentScorer,
+) -> np.ndarray:
+    """Refine the chosen transform (4, 4) by EM-ICP, on a few points and then on all of the model's.
+
+    With matches, the last iterations are enough for the second pass. Generalised ICP follows where
+    it is more exact: on points that the model has not seen, and on points that both clouds share.
+
+    Args:
+        transform: of the source onto the target.
+        hypotheses: from which it was chosen.
+        subsamples: the clouds that they were made from.
+        full: scorer of the clouds, with all their points.
+    """
+    source, target = (cloud[:COARSE_POINTS] for cloud in subsamples)
+    prob = hypotheses.prob
+    some = None if prob is None else prob[: len(source), : len(target)]
+    transform = em_icp(transform, source, target, some)
+    if max(map(len, subsamples)) > COARSE_POINTS:
+        widths = WIDTHS if prob is None else WIDTHS[-FINE_ITERATIONS:]
+        transform = em_icp(transform, *subsamples, prob, widths)
+    more = max(len(full.source), len(full.target)) > MODEL_POINTS
+    return full.refine(transform) if more or full.shares_points(transform) else transform

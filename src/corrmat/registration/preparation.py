@@ -1,0 +1,154 @@
+"""A user's clouds become those that the model sees: checked, centred, scaled and subsampled."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from corrmat.data.normals import estimate_normals
+from corrmat.errors import CorrmatError
+from corrmat.registration.scoring import AlignmentScorer
+
+MODEL_POINTS = 1024  # points of each cloud for the model
+SELECTION_POINTS = 2048  # to select among its hypotheses
+FULL_POINTS = 20_000  # to refine the selected one
+MEDIAN = 0.6  # median distance from the centroid after scaling: a radius of about one
+NORMAL_TOLERANCE = 0.01  # by which the length of a given normal may differ from one
+FAR = 30.0  # median distances from the middle: a point beyond is a stray one and left out
+_LINE = 1e-6  # a cloud that is thinner, relative to its length, is a line
+
+
+class PreparedClouds(NamedTuple):
+    """Two clouds as the model and the choice among its hypotheses see them."""
+
+    clouds: "tuple[Cloud, Cloud]"
+    scale: float  # from the user's units to those in which a cloud's radius is about one
+    subsamples: tuple[np.ndarray, np.ndarray]  # (N, 6) and (M, 6), for the model
+    scorer: AlignmentScorer
+
+
+def prepare_clouds(source: np.ndarray, target: np.ndarray, seed: int) -> PreparedClouds:
+    """Check, centre, scale and subsample two clouds; see `register`."""
+    x, y = Cloud.of(source, "source", seed), Cloud.of(target, "target", seed)
+    scale = 2 * MEDIAN / (x.median + y.median)
+    subsamples = x.with_normals(scale, MODEL_POINTS), y.with_normals(scale, MODEL_POINTS)
+    scorer = AlignmentScorer(x.points(scale, SELECTION_POINTS), y.points(scale, SELECTION_POINTS))
+    return PreparedClouds((x, y), scale, subsamples, scorer)
+
+
+class Cloud:
+    """At most `FULL_POINTS` points of a user's cloud, in canonical order, and their centroid.
+
+    They are ordered by a hash of coordinates and seed, so that the first n are a random subsample
+    that does not depend on the order of the user's rows.
+    """
+
+    def __init__(self, rows: np.ndarray, values: np.ndarray) -> None:
+        self.rows, self.values = rows, values
+        self.centre = values[:, :3].mean(0)
+        self.centred = values[:, :3] - self.centre
+        self.median = float(np.median(np.linalg.norm(self.centred, axis=1)))
+
+    @classmethod
+    def of(cls, cloud: np.ndarray, name: str, seed: int) -> "Cloud":
+        """Check a cloud and bring it into canonical order.
+
+        Raises:
+            CorrmatError: see `register`.
+        """
+        if isinstance(cloud, str | Path):
+            raise CorrmatError(f"{name}: points are needed; corrmat.read_scan reads a file")
+        if isinstance(cloud, np.ma.MaskedArray):
+            raise CorrmatError(f"{name}: a masked array; pass the rows that count, or fill it")
+        try:
+            values = np.asarray(cloud, np.float64)
+        except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError is torch's
+            raise CorrmatError(f"{name}: not an array of numbers ({error})") from error
+        if values.ndim != 2 or values.shape[1] not in (3, 6):
+            raise CorrmatError(f"{name}: array of shape {values.shape}, not (N, 3) or (N, 6)")
+        if len(values) < 3:
+            raise CorrmatError(f"{name}: {len(values)} points; a rotation needs at least 3")
+        bad = np.flatnonzero(~np.isfinite(values).all(1))
+        if len(bad):
+            raise CorrmatError(
+                f"{name}: {len(bad)} points are NaN or infinite, the first is row {bad[0]}"
+            )
+        lengths = np.linalg.norm(values[:, 3:], axis=1)
+        if values.shape[1] > 3 and np.abs(lengths - 1).max() > NORMAL_TOLERANCE:
+            worst = lengths[np.abs(lengths - 1).argmax()]
+            raise CorrmatError(
+                f"{name}: columns 4 to 6 are no unit normals (one has length {worst:.3g}); pass "
+                "the points alone, (N, 3), and normals are estimated"
+            )
+        # A point that is there more than once counts once: its copies would shrink the spacing.
+        rows = np.unique(_hash(values, seed), return_index=True)[1]
+        if values.shape[1] > 3:  # copies may differ in their normals
+            first = np.unique(_hash(values[rows, :3], seed), return_index=True)[1]
+            rows = rows[np.sort(first)]
+        rows = rows[:FULL_POINTS]
+        if len(rows) < 3:
+            many = f"{len(rows)} different points" if len(rows) > 1 else "all points are equal"
+            raise CorrmatError(f"{name}: {many}; the rotation is not determined")
+        rows = rows[is_near(values[rows, :3], values[rows, :3], name)]
+        if len(rows) < 3:
+            raise CorrmatError(f"{name}: {len(rows)} points are left without the stray ones")
+        checked = cls(rows, values[rows])
+        length, breadth, _ = np.linalg.svd(checked.centred, compute_uv=False)[:3]
+        noise = 1e-12 * np.abs(checked.values[:, :3]).max() * np.sqrt(len(rows))
+        if length <= noise:
+            raise CorrmatError(f"{name}: all points are equal; the rotation is not determined")
+        if breadth <= max(_LINE * length, noise):
+            raise CorrmatError(
+                f"{name}: all points lie on one line; the rotation is not determined"
+            )
+        return checked
+
+    def points(self, scale: float, count: int) -> np.ndarray:
+        """Return the first points, (n, 3), centred and scaled."""
+        return self.centred[:count] * scale
+
+    def with_normals(self, scale: float, count: int) -> np.ndarray:
+        """Return the first points with normals, (n, 6); missing normals are estimated from them."""
+        points = self.points(scale, count)
+        given = self.values[:count, 3:]
+        return np.hstack([points, given if given.shape[1] else estimate_normals(points)])
+
+
+def is_near(points: np.ndarray, different: np.ndarray, name: str = "cloud") -> np.ndarray:
+    """Tell which points are no stray ones: (N,) bool.
+
+    Args:
+        points: (N, 3).
+        different: (M, 3) the same, each once: copies would move the middle.
+        name: of the cloud, for the error.
+
+    Raises:
+        CorrmatError: coordinates are too large to be squared.
+    """
+    middle = np.median(different, axis=0)
+    with np.errstate(over="ignore"):
+        distance = np.linalg.norm(points - middle, axis=1)
+        typical = np.median(np.linalg.norm(different - middle, axis=1))
+    if not np.isfinite(typical):
+        raise CorrmatError(f"{name}: coordinates are too large to compute distances")
+    return distance <= FAR * typical
+
+
+def _hash(values: np.ndarray, seed: int) -> np.ndarray:
+    """Hash every row to 64 bits by the finaliser of splitmix64 (Steele et al., 2014)."""
+    state = np.full(len(values), seed, np.uint64)
+    for column in np.ascontiguousarray((values + 0.0).T).view(np.uint64):  # + 0.0: no minus zero
+        state = state * np.uint64(0x9E3779B97F4A7C15) ^ column
+        state = (state ^ state >> np.uint64(30)) * np.uint64(0xBF58476D1CE4E5B9)
+        state = (state ^ state >> np.uint64(27)) * np.uint64(0x94D049BB133111EB)
+        state ^= state >> np.uint64(31)
+    return state
+
+
+def to_original_units(
+    transform: np.ndarray, scale: float, centre_x: np.ndarray, centre_y: np.ndarray
+) -> np.ndarray:
+    """Convert a transform of centred, scaled clouds to the user's coordinates."""
+    converted = transform.copy()
+    converted[:3, 3] = centre_y + transform[:3, 3] / scale - transform[:3, :3] @ centre_x
+    return converted

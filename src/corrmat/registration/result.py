@@ -1,0 +1,71 @@
+"""The result of a registration, for people and for programs."""
+
+import json
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """The rigid transform that takes a source onto a target, and how far to trust it."""
+
+    transform: np.ndarray  # (4, 4) float64, T_target_source in the clouds' own units
+    matches: np.ndarray  # (K, 2) int64 rows of source and target; K = 0 for models without
+    match_confidence: np.ndarray  # (K,) in [0, 1]; neighbours of the same point share it
+    match_agrees: np.ndarray  # (K,) bool: whether the transform takes one end near the other
+    agreement: float  # in [0, 1]: how much of each cloud lies on the other
+    support: float  # in [0, 1]: share of the matches that the transform explains; 1 without any
+    confidence: float  # in [0, 1]: chance that the clouds are aligned, calibrated for "corrmat"
+    rmse: float  # of aligned source points near a target point, in the clouds' units
+    overlap: float  # share of source points near a target point: twice the spacing of points
+    verdict: str  # "aligned", or "probably aligned: " or "doubtful: " and why
+    model: str
+    seed: int
+    seconds: float
+
+    @property
+    def rotation_deg(self) -> float:
+        """The rotation's angle."""
+        cosine = (np.trace(self.transform[:3, :3]) - 1) / 2
+        return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+
+def to_text(registration: Registration) -> str:
+    """Format a registration for people."""
+    x, y, z = registration.transform[:3, 3]
+    lines = [
+        "matrix (target = matrix @ source):",
+        *matrix_lines(registration.transform),
+        f"rotation     {registration.rotation_deg:.3f} deg",
+        f"translation  {x:.6g} {y:.6g} {z:.6g}",
+        f"overlap      {registration.overlap:.1%} of the source has a target point near",
+        f"RMSE         {registration.rmse:.6g} of those" if registration.overlap else "",
+    ]
+    if len(registration.matches):
+        agree, matches = registration.match_agrees.sum(), len(registration.matches)
+        lines.append(f"matches      {agree} of {matches} agree with the transform")
+    fitted = registration.model == "corrmat"
+    note = "" if fitted else "  (fitted to the shipped weights, not to this model)"
+    lines += [
+        f"confidence   {registration.confidence:.0%}{note}",
+        f"verdict      {registration.verdict}",
+    ]
+    lines.append(f"({registration.model}, seed {registration.seed}, {registration.seconds:.2f} s)")
+    return "\n".join(filter(None, lines))
+
+
+def matrix_lines(transform: np.ndarray) -> list[str]:
+    """Format a transform (4, 4), a line a row."""
+    return ["  ".join(f"{value: .12g}".rjust(20) for value in row) for row in transform]
+
+
+def to_json(registration: Registration, source: str, target: str) -> str:
+    """Format a registration, of these files, for programs."""
+    names = ("confidence", "rmse", "overlap", "verdict", "model", "seed", "seconds")
+    values = {name: getattr(registration, name) for name in names}
+    if not np.isfinite(registration.rmse):
+        values["rmse"] = None
+    files = {"source": source, "target": target}
+    content = {**files, "transform": registration.transform.tolist(), **values}
+    return json.dumps(content, indent=1) + "\n"
