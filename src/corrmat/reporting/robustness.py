@@ -179,7 +179,7 @@ def draw_figure(result: Robustness, path: Path) -> None:
     for axes in (left, right):
         axes.set(xlabel="per cent corrupted", ylabel="rotation error, deg")
         axes.grid(alpha=0.3)
-        axes.legend(fontsize="small")
+        axes.legend(fontsize="small", ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.14))
     save(canvas, path)
 
 
