@@ -549,8 +549,8 @@ def test_the_last_title_of_an_animation_fits_into_it(pair):
 @pytest.mark.parametrize(
     ("confidence", "words"),
     [
-        (0.92, "aligned"),
-        (0.91, "probably aligned: why"),
+        (0.93, "aligned"),
+        (0.92, "probably aligned: why"),
         (0.5, "probably aligned: why"),
         (0.49, "doubtful: why"),
     ],
