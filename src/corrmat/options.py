@@ -93,6 +93,8 @@ ASC, PTS, NPY, NPZ. Both files must have the same unit, whichever it is. Parts m
 from either.
 
 verdict: "aligned" from a confidence of 93 % on, "probably aligned" from 50 %, else "doubtful".
+It holds for single objects. In rooms a confident verdict is often wrong: look at --html, and
+compare with --model kiss.
 exit codes: 0 done, whatever the verdict; 2 a file cannot be used, and one line says why."""
 
 Scale = Literal["smoke", "laptop", "overnight", "paper"]
