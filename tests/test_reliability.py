@@ -245,7 +245,7 @@ def test_a_record_that_cannot_be_finished_leaves_whole_files(tmp_path, monkeypat
     assert "lr: 0.002" in files()["config.yaml"].decode()
 
 
-@pytest.mark.parametrize("words", [["run", "--help"], ["completion", "bash"], []])
+@pytest.mark.parametrize("words", [["run", "--help"], []])
 def test_a_reader_that_leaves_early_gets_no_traceback(words):
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"}
     process = subprocess.Popen(
