@@ -632,7 +632,7 @@ def test_a_board_that_nobody_watches_draws_nothing(tmp_path):
     assert text.getvalue() == ""
 
 
-@pytest.mark.parametrize("arm", ["1.1 DCP", "2.2 RPMNet_corr"])
+@pytest.mark.parametrize("arm", ["1.1 DCP", "2.2 RPMNet_corr", "3.2 PCRNet"])
 def test_a_machine_that_is_fast_in_bfloat16_trains_in_it(arm, tmp_path, monkeypatch):
     monkeypatch.setattr(hardware, "fast_precision", lambda accelerator: "bf16-mixed")
     dtypes = []
@@ -644,7 +644,8 @@ def test_a_machine_that_is_fast_in_bfloat16_trains_in_it(arm, tmp_path, monkeypa
 
     monkeypatch.setattr(RegistrationModule, "training_step", noted)
     identity, name = arm.split()
-    loaded = load(identity, "--trainer.accelerator", "cpu", arms=[name])
+    options = ("--trainer.accelerator", "cpu", "--trainer.precision", "auto")
+    loaded = load(identity, *options, arms=[name])
     assert loaded.arms[name].trainer.gradient_clip_val
     ready = prepare(loaded.arms[name])
     trained = fit.train(ready, tmp_path / name)

@@ -1,9 +1,11 @@
+import pytest
 import torch
 from conftest import random_rotation
 from scipy.spatial.transform import Rotation
 from twins import chamfer_loss_dense
 
-from corrmat.losses import chamfer_loss
+from corrmat.data.datamodule import RegistrationDataModule
+from corrmat.losses import ChamferLoss, chamfer_loss
 from corrmat.methods import PCRNet, PCRNetCorr
 from corrmat.networks.pcrnet import PCRNetCorrNetwork, PCRNetwork, quaternion_to_matrix
 from corrmat.ops import rigid
@@ -79,6 +81,26 @@ def test_the_papers_sizes_and_optimizers():
         1e-3,
         1e-4,
     )
+
+
+@pytest.mark.slow
+def test_the_pose_network_overfits_eight_pairs():
+    torch.manual_seed(0)
+    data = RegistrationDataModule(
+        num_points=48, batch_size=8, rotation_deg=45, translation=0, test_shapes=8
+    )
+    batch = next(iter(data.test_dataloader()))
+    method = PCRNet({"width": 128})
+    adam = torch.optim.Adam(method.parameters(), 1e-4)
+    losses = []
+    for _ in range(400):
+        loss = ChamferLoss().loss(method(batch.source, batch.target), batch)
+        adam.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(method.parameters(), 1.0)
+        adam.step()
+        losses.append(loss.item())
+    assert min(losses) < 0.4 * losses[0]
 
 
 def test_a_quaternion_turns_like_its_matrix(generator):

@@ -95,7 +95,7 @@ def train_weights() -> None:
         results = _config_folder().parent / "results"
         if ships and arm.start == "corrmat":
             shipping.refuse_used_seed(results, arm.seed)
-        _run_command(words)
+        _fit(options)
         if ships and hardware.is_first_process():
             folder = options.runs / loaded.place / arm.name
             facts = runs.trained_facts(folder)
@@ -239,7 +239,7 @@ def _compare(options: Namespace) -> int:
         if options.data != "shapes" or options.root:
             raise CorrmatError("rooms are procedural: --data and --root go with other protocols")
         about["data"] = "procedural"
-    code = commit()
+    code = commit() if options.record is not None else None
     pairs = benchmark.frozen_pairs(**about, root=options.root, count=options.pairs)
     results = benchmark.compare(pairs, models)
     fewer = f", one of each shape: {options.pairs} were asked for"

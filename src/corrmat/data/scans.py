@@ -8,7 +8,7 @@ import io
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
@@ -24,7 +24,6 @@ CLOUDS = (".pcd", ".xyz", ".txt", ".csv", ".asc", ".pts", ".npy", ".npz")
 SAMPLES = 20_000  # points taken of a mesh's surface
 _POINTS = ("points", "xyz", "pos")  # usual names of an array of points beside others
 _XYZ = {"x", "y", "z"}
-_END, _LONGEST_HEADER = b"end_header", 65_536  # of a PLY file, in bytes
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+").fullmatch
 _FACES = re.compile(rb"^element (face|tristrips) +[1-9]", re.MULTILINE)
 
@@ -116,9 +115,9 @@ def write_moved(path: Path, scan: Path, transform: np.ndarray) -> None:
     Raises:
         CorrmatError: there is no folder to write into, or see `read_scan`.
     """
-    import plyfile
-
     if scan.suffix.lower() == ".ply":
+        import plyfile
+
         with contextlib.suppress(plyfile.PlyParseError):  # a mesh that trimesh reads all the same
             content = _ply_content(scan)
             _move_vertices(content["vertex"], transform)
@@ -203,7 +202,7 @@ def _scene(path: Path) -> "np.ndarray | trimesh.Trimesh":
 def _ply(path: Path) -> "np.ndarray | trimesh.Trimesh":
     """Return the vertices of a PLY file without faces; read one with faces as a mesh."""
     with path.open("rb") as file:
-        header = file.read(_LONGEST_HEADER).partition(_END)[0]
+        header = _ply_header(file)
     if _FACES.search(header):
         return _scene(path)
     vertices = _ply_content(path)["vertex"]
@@ -217,9 +216,20 @@ def _ply_content(path: Path) -> "plyfile.PlyData":
     """Read a PLY file; its header may have comments in any encoding, and blanks at line ends."""
     import plyfile
 
-    header, end, body = path.read_bytes().partition(_END)
-    header = re.sub(rb"[ \t]+\n", b"\n", header).decode("ascii", "replace")
-    return plyfile.PlyData.read(io.BytesIO(header.encode("ascii", "replace") + end + body))
+    with path.open("rb") as file:
+        header = re.sub(rb"[ \t]+\n", b"\n", _ply_header(file)).decode("ascii", "replace")
+        content = header.encode("ascii", "replace") + file.read()
+    return plyfile.PlyData.read(io.BytesIO(content))
+
+
+def _ply_header(file: BinaryIO) -> bytes:
+    """Read the header of a PLY file, its last line included."""
+    header = b""
+    for line in file:
+        header += line
+        if line.startswith(b"end_header"):
+            break
+    return header
 
 
 def _fields(vertices: "plyfile.PlyElement", names: Iterable[str]) -> list[str]:
@@ -315,7 +325,7 @@ def _check_rows(path: Path, lines: list[str], separator: str | None, columns: li
 
 def _cells(line: str, separator: str | None) -> list[str]:
     """Split a line at its separator, or else at its white space; take off quotes."""
-    return [cell.strip(" \t\"'") for cell in line.split(separator)]
+    return [cell.strip().strip("\"'") for cell in line.split(separator)]
 
 
 def _is_number(word: str) -> bool:

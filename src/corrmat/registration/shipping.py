@@ -18,11 +18,11 @@ from corrmat.errors import CorrmatError
 from corrmat.files import ensure_writable, replace_text
 from corrmat.metrics import ADDS_THRESHOLD
 from corrmat.registration import benchmark
+from corrmat.reporting.comparisons import TRAINING, training_runs
 from corrmat.revision import commit
 from corrmat.types import PairBatch
 
 CALIBRATION_PAIRS = {512: 200, 1024: 100}  # of a protocol, by points of a cloud
-_TRAINING = Path("register", "training.json")  # below results/
 CALIBRATION_PROTOCOLS: tuple[benchmark.Protocol, ...] = ("real", "views", "clean")
 
 
@@ -62,7 +62,7 @@ def refuse_used_seed(results: Path, seed: int) -> None:
     Raises:
         CorrmatError: a run of results/register/training.json has it.
     """
-    if seed in (run.get("seed") for run in _training_runs(results)):
+    if seed in (run.get("seed") for run in training_runs(results)):
         raise CorrmatError(
             f"the shipped weights have trained with seed {seed}: it would repeat the same shapes; "
             "give another --seed"
@@ -82,14 +82,9 @@ def recalibrate() -> None:
 
 def add_training(results: Path, run: dict[str, object]) -> None:
     """Add a training run to results/register/training.json."""
-    path = results / _TRAINING
+    path = results / TRAINING
     path.parent.mkdir(parents=True, exist_ok=True)
-    replace_text(path, json.dumps([*_training_runs(results), run], indent=1) + "\n")
-
-
-def _training_runs(results: Path) -> list[dict[str, Any]]:
-    path = results / _TRAINING
-    return json.loads(path.read_text()) if path.is_file() else []
+    replace_text(path, json.dumps([*training_runs(results), run], indent=1) + "\n")
 
 
 def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:

@@ -25,7 +25,13 @@ from corrmat.reporting.intervals import (
     read_errors,
 )
 from corrmat.reporting.record import ArmResult, Record
-from corrmat.reporting.tables import markdown_head, markdown_row, paper_metric, ratio_cell
+from corrmat.reporting.tables import (
+    arm_ratio,
+    markdown_head,
+    markdown_row,
+    paper_metric,
+    ratio_cell,
+)
 
 Verdict = Literal["confirmed", "confirmed in direction", "not shown", "contradicted"]
 Kind = Literal["registers better", "converges sooner", "other claims"]
@@ -116,7 +122,7 @@ def less_error(evidence: Evidence) -> Claim:
     ratio = ratio_of_medians(evidence.baseline, evidence.treatment)
     learnt = evidence.left_identity(evidence.baseline)
     theirs = by_paper_metric(record, record.paper)
-    paper_ratio = theirs[0] / theirs[1] if theirs[0] and theirs[1] else None
+    paper_ratio = arm_ratio(theirs)
     p = p_of_equal_errors(evidence.baseline, evidence.treatment)
     flips = evidence.baseline.flipped, evidence.treatment.flipped
     arms = [as_text(median_rotation(e), "deg") for e in (evidence.baseline, evidence.treatment)]

@@ -15,6 +15,7 @@ from corrmat.reporting.tables import markdown_head, markdown_row
 from corrmat.weights import shipped_metadata
 
 OURS = "corrmat"
+TRAINING = Path("register", "training.json")  # below results/: how the shipped weights were trained
 _PROTOCOLS = ("real", "views", "clean", "rooms")  # in the order of the tables
 _KINDS = {"single objects": ("shapes", "modelnet40"), "rooms": ("procedural",)}  # data sets of each
 _BINS = 10  # of the expected calibration error
@@ -178,7 +179,7 @@ def expected_calibration_error(promised: np.ndarray, happened: np.ndarray) -> fl
 
 def doubling_summary(results: Path) -> str:
     """Say what twice the training pairs would bring, by a line through the ends of the runs."""
-    runs = _training_runs(results)
+    runs = training_runs(results)
     if len(runs) < 2:
         return "Fewer than two training runs are recorded."
     gains = []
@@ -192,9 +193,9 @@ def doubling_summary(results: Path) -> str:
     )
 
 
-def _training_runs(results: Path) -> list[dict]:
+def training_runs(results: Path) -> list[dict]:
     """Read how the shipped weights were trained, a run an entry; none if nothing is recorded."""
-    path = results / "register" / "training.json"
+    path = results / TRAINING
     return json.loads(path.read_text()) if path.is_file() else []
 
 
@@ -211,7 +212,7 @@ def draw_training(results: Path) -> None:
     A dotted line is the fit of `doubling_summary`, as far as twice the pairs.
     Nothing is drawn where results/register/training.json is missing.
     """
-    runs = _training_runs(results)
+    runs = training_runs(results)
     if not runs:
         return
     figure = Figure(figsize=(8.2, 3), layout="constrained")

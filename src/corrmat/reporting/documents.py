@@ -4,7 +4,7 @@ import functools
 import json
 import math
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from corrmat.errors import CorrmatError
@@ -32,8 +32,9 @@ from corrmat.reporting.comparisons import (
 from corrmat.reporting.intervals import Estimate, as_text
 from corrmat.reporting.matrices import draw_matrices
 from corrmat.reporting.overview import draw_overview, longest_records
-from corrmat.reporting.record import ArmResult, Record, defined, read_records
+from corrmat.reporting.record import Record, defined, read_records
 from corrmat.reporting.tables import (
+    arm_ratio,
     cell,
     markdown_head,
     markdown_row,
@@ -86,28 +87,22 @@ def headline_table(results: Results) -> str:
     lines = markdown_head(heads)
     records = [r for r in longest_records(results.records) if r.id in HEADLINES]
     lines += [markdown_row(headline(read_evidence(record, results.folder))) for record in records]
-    pairs = [
-        (_paper_ratio(record, record.arms), _paper_ratio(record, record.paper))
+    ratios = [
+        [arm_ratio(by_paper_metric(record, of)) or math.nan for of in (record.arms, record.paper)]
         for record in records
     ]
-    ahead = sum(ours > 1 for ours, _ in pairs)
-    near = sum(ours >= NEAR_PAPER * theirs for ours, theirs in pairs)
+    ahead = sum(ours > 1 for ours, _ in ratios)
+    near = sum(ours >= NEAR_PAPER * theirs for ours, theirs in ratios)
     counted = count_verdicts(results.claims)
     return "\n".join(
         [
             *lines,
             "",
-            f"By the paper's metric METHOD_corr is ahead in {ahead} of these {len(pairs)} "
+            f"By the paper's metric METHOD_corr is ahead in {ahead} of these {len(ratios)} "
             f"experiments, and in {near} by at least half of the paper's ratio.",
             f"All verdicts of the [ledger](docs/claims.md): {counted}.",
         ]
     )
-
-
-def _paper_ratio(record: Record, results: Mapping[str, ArmResult]) -> float:
-    """Compute the ratio of METHOD's to METHOD_corr's error by the paper's metric."""
-    baseline, treatment = by_paper_metric(record, results)
-    return (baseline or 0) / treatment if treatment else math.nan
 
 
 def rates_table(results: Path) -> str:

@@ -62,7 +62,7 @@ def draw_overview(records: Sequence[Record]) -> bytes:
 
 def _draw_panel(axes: Axes, record: Record) -> None:
     """Draw the arms of one experiment and the identity guess."""
-    colours = arm_colours(record)
+    colours, seen = arm_colours(record), []
     for arm, result in record.arms.items():
         x, y = _band_points(result) if result.bands else _curve_points(result)
         if not x:
@@ -70,24 +70,22 @@ def _draw_panel(axes: Axes, record: Record) -> None:
         role = {record.baseline: "METHOD", record.treatment: "METHOD_corr"}.get(arm, "controls")
         colour, width = (GREEN, 0.8) if role == "controls" else (colours[arm], 1.6)
         axes.plot(x, y, color=colour, linewidth=width, label=role)
+        seen += x
     identity = record.baselines.get("identity", ArmResult({})).metrics.get(METRIC)
     if identity:
         axes.axhline(identity, color=GREY, linestyle="--", linewidth=1, label="identity guess")
     trained = any(not result.bands for result in record.arms.values())
     if trained:
         axes.set_xscale("log")
-        pairs = [x for result in record.arms.values() for x in _curve_points(result)[0]]
-        axes.set_xticks([min(pairs), max(pairs)] if pairs else [])
+        axes.set_xticks([min(seen), max(seen)] if seen else [])
         axes.xaxis.set_minor_locator(NullLocator())
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     else:
         axes.set_xlabel("initial misalignment, deg", fontsize="x-small")
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter("{x:g}")
-    few = LogFormatter(
-        minor_thresholds=(1.3, 0.6)
-    )  # labels between powers of ten, if there are few
-    axes.yaxis.set_minor_formatter(few)
+    # Labels between the powers of ten, where there are few of these.
+    axes.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.3, 0.6)))
     axes.tick_params(which="minor", labelsize="xx-small")
     axes.tick_params(labelsize="x-small")
     axes.grid(alpha=0.3)

@@ -9,7 +9,7 @@ import yaml
 
 from corrmat.data.registry import DATASETS, is_generated
 from corrmat.methods import METHODS
-from corrmat.reporting.record import Record
+from corrmat.reporting.record import COMMITS, Record
 from corrmat.revision import PACKAGE, git
 
 # The modules that compute an arm's numbers; what they import belongs to it, up to the boundary.
@@ -47,7 +47,7 @@ def staleness(record: Record, repository: Path) -> str:
         repository: a checkout that has these commits.
     """
     trained = (str(arm.trained_at or record.commit) for arm in record.arms.values())
-    commits = {commit for each in trained for commit in each.split(" / ")}
+    commits = {commit for each in trained for commit in each.split(COMMITS)}
     if any(name == "None" or name.endswith("+") for name in commits):
         return "trained with uncommitted code"
     code = [f"src/{path}" for path in code_of(record.family, record.arms)]

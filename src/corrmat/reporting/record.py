@@ -163,6 +163,9 @@ class Record:
         return Record(**fields)  # pyright: ignore[reportArgumentType] (our own file)
 
 
+COMMITS = " / "  # between the commits of an arm that was trained by more than one
+
+
 def place_of(scale: str, data: str, identity: str, seed: int) -> Path:
     """Return the folder of an experiment below results/ and runs/; seed 0 goes without saying."""
     return Path(scale, data, identity if seed == 0 else f"{identity}-seed{seed}")

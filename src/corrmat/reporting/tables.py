@@ -168,11 +168,17 @@ def markdown_row(cells: Sequence[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
+def arm_ratio(values: Sequence[float | None]) -> float | None:
+    """Compute the ratio of METHOD to METHOD_corr; None if one is missing."""
+    if len(values) < 2 or values[0] is None or not values[1]:
+        return None
+    return values[0] / values[1]
+
+
 def ratio_cell(values: Sequence[float | None]) -> str:
     """Format the ratio of METHOD to METHOD_corr; empty if one is missing."""
-    if len(values) < 2 or values[0] is None or not values[1]:
-        return ""
-    return f"{values[0] / values[1]:.3g}"
+    value = arm_ratio(values)
+    return "" if value is None else f"{value:.3g}"
 
 
 def cell(value: float | None, metric: str) -> str:

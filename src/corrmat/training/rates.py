@@ -68,6 +68,7 @@ def sweep(
     endless = [name for name, settings in arms.items() if settings.trainer.max_steps < 1]
     if endless:
         raise CorrmatError(f"{endless[0]} has no --trainer.max_steps to take a twentieth of")
+    today = commit()
     place = replace(recipe, id=f"{recipe.id}-rates", networks_of=None)
     swept: dict[str, list[RateResult]] = {}
     with Board() as board:
@@ -81,7 +82,7 @@ def sweep(
                     trained = train_or_reuse(place, arm, runs_folder, logger, board, fresh=fresh)
                 except DivergedError as diverged:
                     log.info(str(diverged))
-                    swept[name].append(RateResult(lr, None, None, None, commit()))
+                    swept[name].append(RateResult(lr, None, None, None, today))
                     continue
                 last = trained.curve[-1]
                 error, loss = defined(last[_METRIC]), defined(last["loss"])
