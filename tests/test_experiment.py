@@ -516,10 +516,29 @@ def test_ransac_solves_identical_points(tmp_path):
     assert record.baselines["ransac"].get("rotation_error_deg_median") < 1e-4
 
 
-@pytest.mark.parametrize("option", ["iterations", "test_iterations"])
-def test_a_network_without_an_iteration_is_refused_before_training(option, tmp_path):
-    with pytest.raises(CorrmatError, match="cannot build RPMNet from the --network options"):
-        experiment.run(load("2.1", f"--network.{option}", "0"), tmp_path / "r", tmp_path / "runs")
+@pytest.mark.parametrize(
+    ("experiment_id", "option", "size"),
+    [
+        ("1.1", "width", "33"),
+        ("1.1", "heads", "0"),
+        ("1.1", "feedforward", "0"),
+        ("1.1", "k", "0"),
+        ("1.1", "edge_channels", "[]"),
+        ("2.1", "width", "12"),
+        ("2.1", "annealing_width", "8"),
+        ("2.1", "iterations", "0"),
+        ("2.1", "test_iterations", "0"),
+        ("3.1", "width", "0"),
+        ("../weights", "heads", "0"),
+        ("../weights", "neighbors", "0"),
+    ],
+)
+def test_a_network_refuses_impossible_sizes_before_training(experiment_id, option, size, tmp_path):
+    message = r"cannot build \w+ from the --network options: \w+ -?\d+ is not"
+    with pytest.raises(CorrmatError, match=message):
+        experiment.run(
+            load(experiment_id, f"--network.{option}", size), tmp_path / "r", tmp_path / "runs"
+        )
     assert not list(tmp_path.rglob("*.ckpt"))
 
 

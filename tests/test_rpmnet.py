@@ -3,6 +3,7 @@ import torch
 from conftest import random_rotation
 
 from corrmat.data.datamodule import RegistrationDataModule
+from corrmat.errors import CorrmatError
 from corrmat.losses import CorrespondenceLoss, RegistrationLoss, registration_loss
 from corrmat.methods import RPMNet, RPMNetCorr
 from corrmat.metrics import match_accuracy, rotation_error_deg
@@ -79,7 +80,7 @@ def test_pair_features_do_not_see_a_rotation_of_the_cloud(generator):
 def test_clouds_without_normals_are_refused():
     with pytest.raises(ValueError, match="needs normals"):
         small()(torch.zeros(1, 10, 3), torch.zeros(1, 10, 3))
-    with pytest.raises(ValueError, match="not a multiple of 8"):
+    with pytest.raises(CorrmatError, match="not a multiple of 8"):
         RPMNetwork(width=12)
 
 

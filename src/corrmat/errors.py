@@ -27,11 +27,11 @@ def require_positive(**sizes: int) -> None:
     """Check the sizes that a network is built with.
 
     Raises:
-        ValueError: a size is not positive; the message names it.
+        CorrmatError: a size is not positive; the message names it.
     """
     for name, size in sizes.items():
         if size < 1:
-            raise ValueError(f"{name} {size} is not positive")
+            raise CorrmatError(f"{name} {size} is not positive")
 
 
 def check_choices(settings: object) -> None:

@@ -4,6 +4,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from corrmat.errors import CorrmatError, require_positive
+
 
 class Transformer(nn.Module):
     """The pointer of DCP v2: updates a cloud's features with attention to the other cloud's.
@@ -16,6 +18,7 @@ class Transformer(nn.Module):
 
     def __init__(self, width: int = 512, heads: int = 4, feedforward: int = 1024) -> None:
         super().__init__()
+        require_positive(width=width, feedforward=feedforward)
         self.encoder = EncoderBlock(width, heads, feedforward)
         self.decoder = DecoderBlock(width, heads, feedforward)
         self.encoder_norm = StdNorm(width)
@@ -67,7 +70,7 @@ class Attention(nn.Module):
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
         if heads < 1 or width % heads:
-            raise ValueError(f"width {width} is not a multiple of {heads} heads")
+            raise CorrmatError(f"width {width} is not a multiple of {heads} heads")
         self.heads = heads
         self.query, self.key, self.value, self.out = (nn.Linear(width, width) for _ in range(4))
 

@@ -44,7 +44,10 @@ class InvariantNetwork(nn.Module):
         shares: tuple[float, ...] = (0.05, 0.1, 0.2),
     ) -> None:
         super().__init__()
-        require_positive(anchors=anchors, test_anchors=test_anchors, neighbors=neighbors)
+        require_positive(
+            width=width, heads=heads, anchors=anchors, test_anchors=test_anchors,
+            neighbors=neighbors,
+        )  # fmt: skip
         self.min_points = 3
         self.anchors, self.test_anchors = anchors, test_anchors
         self.neighbors, self.shares = neighbors, shares

@@ -78,6 +78,7 @@ class PCRNetCorrNetwork(nn.Module):
 
     def __init__(self, width: int = 512) -> None:
         super().__init__()
+        require_positive(width=width)
         self.embed = PointNet(width, nn.BatchNorm1d, bias=False)
         self.matching_head = MatchingHead(width)
 

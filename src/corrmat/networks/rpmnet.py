@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from corrmat.errors import require_positive
+from corrmat.errors import CorrmatError, require_positive
 from corrmat.networks.pointnet import shared_mlp
 from corrmat.networks.ppf import Neighborhoods, neighborhoods
 from corrmat.ops import rigid
@@ -49,8 +49,9 @@ class RPMNetwork(nn.Module):
         annealing_width: int = 1024,
     ) -> None:
         super().__init__()
-        if width < 8 or width % 8:
-            raise ValueError(f"width {width} is not a multiple of 8, the groups of its norms")
+        for name, size, groups in ("width", width, 8), ("annealing_width", annealing_width, 16):
+            if size < groups or size % groups:
+                raise CorrmatError(f"{name} {size} is not a multiple of {groups} groups")
         require_positive(
             k=k, iterations=iterations, test_iterations=test_iterations,
             sinkhorn_iterations=sinkhorn_iterations,

@@ -67,16 +67,14 @@ def build_method(settings: ArmSettings) -> Method:
     """Build the method of these settings, freshly initialised.
 
     Raises:
-        CorrmatError: the network or loss cannot be built with these options. Whatever a network
-            of the user's own raises is not reworded.
+        CorrmatError: the network or loss refuses these options. Whatever else a network of the
+            user's own raises is not reworded.
     """
     network, loss = settings.network.as_dict(), settings.loss.as_dict()
     method = METHODS[settings.method]
     try:
         return method(network, loss, settings.optimizer)
-    except (ValueError, RuntimeError, ArithmeticError) as error:
-        if not method.network_type.__module__.startswith("corrmat."):
-            raise
+    except CorrmatError as error:
         raise CorrmatError(
             f"cannot build {settings.method} from the --network options: {error}"
         ) from error
