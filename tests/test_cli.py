@@ -174,6 +174,14 @@ def test_a_checkpoint_of_another_network_is_refused(tmp_path, capsys):
     assert "train first" in capsys.readouterr().err
 
 
+def test_a_missing_checkpoint_is_named_before_any_shape_is_made(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("CORRMAT_CACHE", str(tmp_path / "cache"))
+    words = ["--config", str(ROOT / "configs/exp/1.2.yaml"), "--runs", str(tmp_path / "runs")]
+    assert main(["evaluate", *words]) == 2
+    assert "train first" in capsys.readouterr().err
+    assert not (tmp_path / "cache").exists()
+
+
 def test_a_shell_completes_commands_and_typed_options():
     process = run("completion", "bash")
     assert process.returncode == 0, process.stderr

@@ -13,7 +13,6 @@ from corrmat.errors import CorrmatError
 from corrmat.options import EXPERIMENT_COMMANDS, SHORT_HELP, build_parser, parse
 
 if TYPE_CHECKING:
-    from corrmat.training.preflight import Arm
     from corrmat.training.recipe import Recipe
 
 
@@ -160,10 +159,11 @@ def _run(options: Namespace) -> int:
 
 def _fit(options: Namespace) -> int:
     """Train one arm."""
-    loaded, arm = _prepare_arm(options)
+    loaded = _load_arm(options)
     from corrmat.files import ensure_writable
-    from corrmat.training import console, experiment
+    from corrmat.training import console, experiment, preflight
 
+    arm = preflight.prepare(loaded.arms[loaded.treatment])
     ensure_writable(options.runs / loaded.place / arm.name)
     with console.Board() as board:
         trained = experiment.train_or_reuse(
@@ -175,36 +175,38 @@ def _fit(options: Namespace) -> int:
 
 def _evaluate(options: Namespace) -> int:
     """Test the checkpoint of one arm."""
-    loaded, arm = _prepare_arm(options)
+    loaded = _load_arm(options)
     from corrmat.metrics import summary
-    from corrmat.training import experiment, fit, runs
+    from corrmat.training import experiment, fit, preflight, runs
 
-    checkpoint = options.checkpoint or runs.best_checkpoint(loaded, arm, options.runs)
-    if options.checkpoint is None and not checkpoint.is_file():
-        others = options.runs.glob(f"*/{loaded.data}/{loaded.place.name}/{arm.name}/best.ckpt")
+    name = loaded.treatment
+    folders = runs.arm_folders(loaded, name, options.runs)
+    if options.checkpoint is None and not any((f / "best.ckpt").is_file() for f in folders):
+        others = options.runs.glob(f"*/{loaded.data}/{loaded.place.name}/{name}/best.ckpt")
         scales = ", ".join(sorted(path.relative_to(options.runs).parts[0] for path in others))
         hint = f"there is one of --scale {scales}" if scales else "train first (corrmat fit)"
-        raise CorrmatError(f"no checkpoint {checkpoint}; {hint}")
+        raise CorrmatError(f"no checkpoint {folders[0] / 'best.ckpt'}; {hint}")
+    arm = preflight.prepare(loaded.arms[name])
+    checkpoint = options.checkpoint or runs.best_checkpoint(loaded, arm, options.runs)
     method = fit.load_trained(arm, checkpoint)
     print(f"checkpoint: {checkpoint}")
     tests = fit.score(method, arm, experiment.bands(loaded.bands_deg))
     for band, per_pair in enumerate(tests):
         if loaded.bands_deg:
             print(f"\n{loaded.bands_deg[band]:g} to {loaded.bands_deg[band + 1]:g} deg")
-        for name, value in summary(per_pair).items():
-            print(f"{name:28s} {value:.6g}")
+        for metric, value in summary(per_pair).items():
+            print(f"{metric:28s} {value:.6g}")
     return 0
 
 
-def _prepare_arm(options: Namespace) -> "tuple[Recipe, Arm]":
-    """Load the recipe with one arm, --arm or its METHOD_corr, and prepare that arm."""
+def _load_arm(options: Namespace) -> "Recipe":
+    """Load the recipe with one arm: --arm, or its METHOD_corr."""
     config = _required_config(options)
-    from corrmat.training import preflight, recipe
+    from corrmat.training import recipe
 
     _prepare_output(options)
     arms = [options.arm] if options.arm else None
-    loaded = recipe.load(config, options.scale, options.overrides, arms)
-    return loaded, preflight.prepare(loaded.arms[loaded.treatment])
+    return recipe.load(config, options.scale, options.overrides, arms)
 
 
 def _required_config(options: Namespace) -> Path:
