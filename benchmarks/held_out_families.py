@@ -15,6 +15,7 @@ from pathlib import Path
 from corrmat.cli import main as corrmat
 from corrmat.data.shapes.dataset import NAMES, SIZE
 from corrmat.registration import benchmark
+from corrmat.reporting.model_results import write_comparison
 from corrmat.revision import commit
 from corrmat.types import PairBatch
 
@@ -63,7 +64,7 @@ def main(root: str | None = None) -> None:
     print(benchmark.to_table(results))
     about = {"protocol": "real", "points": 512, **{name: list(g) for name, g in GROUPS.items()}}
     path = ROOT / "results" / "register" / "held_out_families.json"
-    benchmark.write_results(path, results, about | {"commit": code, "settings": SETTINGS})
+    write_comparison(path, results, about | {"commit": code, "settings": SETTINGS})
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from rich.progress import track
 from corrmat.baselines import FpfhSettings, KissSettings, fpfh_ransac, kiss_matcher
 from corrmat.registration import benchmark
 from corrmat.registration.scoring import AlignmentScorer
+from corrmat.reporting.model_results import ModelResult, write_comparison
 from corrmat.revision import commit
 from corrmat.types import PairBatch
 
@@ -48,7 +49,7 @@ PIPELINES: dict[str, Callable[[np.ndarray, np.ndarray, float], np.ndarray]] = {
 }  # fmt: skip
 
 
-def run(pairs: PairBatch, name: str, voxel: float) -> benchmark.ModelResult:
+def run(pairs: PairBatch, name: str, voxel: float) -> ModelResult:
     """Register all pairs with one pipeline, refined on all points."""
     outcomes = []
     for index in track(range(len(pairs)), f"{name}, {voxel} m", transient=True):
@@ -80,7 +81,7 @@ def main() -> None:
     print(benchmark.to_table(results))
     about = {"protocol": "rooms", "data": "procedural", "points": POINTS, "pairs": len(pairs)}
     path = RESULTS / f"rooms-procedural-{POINTS}.json"
-    benchmark.write_results(path, results, about | {"commit": code, "tuning": tried})
+    write_comparison(path, results, about | {"commit": code, "tuning": tried})
 
 
 if __name__ == "__main__":

@@ -228,6 +228,7 @@ def _compare(options: Namespace) -> int:
     """Compare models on the frozen pairs of a protocol."""
     from corrmat.files import ensure_writable
     from corrmat.registration import benchmark
+    from corrmat.reporting.model_results import write_comparison
     from corrmat.revision import commit
 
     models = [name.strip() for name in options.models.split(",") if name.strip()]
@@ -248,9 +249,7 @@ def _compare(options: Namespace) -> int:
     print(f"{len(pairs)} pairs{fewer if len(pairs) < options.pairs else ''}")
     print(benchmark.to_table(results))
     if options.record is not None:
-        benchmark.write_results(
-            options.record, results, about | {"pairs": len(pairs), "commit": code}
-        )
+        write_comparison(options.record, results, about | {"pairs": len(pairs), "commit": code})
         print(f"record: {options.record}")
     return 0
 

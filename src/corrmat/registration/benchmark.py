@@ -1,9 +1,8 @@
 """Compare models on the same frozen pairs: what `corrmat compare` prints."""
 
-import json
 import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -16,9 +15,9 @@ from corrmat.data.pairs import STREAM, Key, PairSettings, Split, make_pairs
 from corrmat.data.registry import load_clouds
 from corrmat.data.room_pairs import make_room_pair
 from corrmat.errors import CorrmatError
-from corrmat.files import replace_text
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG, rotation_error_deg
 from corrmat.registration.register import register
+from corrmat.reporting.model_results import ModelResult
 from corrmat.types import PairBatch
 
 Protocol = Literal["paper", "real", "views", "clean", "rooms"]
@@ -47,18 +46,6 @@ COLUMNS = {
     "recall_adds": "recall ADD-S",
     "ms": "ms a pair",
 }
-
-
-@dataclass(frozen=True)
-class ModelResult:
-    """A model's errors on all pairs; keys of the record's JSON."""
-
-    mean_deg: float
-    median_deg: float
-    recall_5deg: float
-    recall_adds: float
-    ms: float
-    per_pair: dict[str, list[float]]
 
 
 class Outcome(NamedTuple):
@@ -156,23 +143,6 @@ def summarise(pairs: PairBatch, outcomes: Sequence[Outcome]) -> ModelResult:
             "support": np.round(support, 4).tolist(),
         },
     )
-
-
-def write_results(
-    path: Path, results: Mapping[str, ModelResult], about: Mapping[str, object]
-) -> None:
-    """Write the record of a comparison.
-
-    Args:
-        path: of the JSON file.
-        results: by model.
-        about: the pairs, and the commit of the code that registered them.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    models = {name: asdict(result) for name, result in results.items()}
-    hardware = {"threads": torch.get_num_threads(), "cpu": torch.backends.cpu.get_cpu_capability()}
-    content = {**about, "hardware": hardware, "models": models}
-    replace_text(path, json.dumps(content, indent=1) + "\n")
 
 
 def to_table(results: Mapping[str, ModelResult]) -> str:

@@ -5,7 +5,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from scipy.optimize import minimize
@@ -16,9 +16,8 @@ from corrmat.data.datamodule import RegistrationDataModule
 from corrmat.data.pairs import STREAM, Key, make_pairs
 from corrmat.errors import CorrmatError
 from corrmat.files import ensure_writable, replace_text
-from corrmat.metrics import ADDS_THRESHOLD
 from corrmat.registration import benchmark
-from corrmat.reporting.comparisons import TRAINING, training_runs
+from corrmat.reporting.comparisons import TRAINING, TrainingRun, training_runs
 from corrmat.revision import commit
 from corrmat.types import PairBatch
 
@@ -52,7 +51,7 @@ def ship(
         commit=str(shipped_by), calibration=json.dumps(calibration), pairs=str(pairs),
     )  # fmt: skip
     run = {"before": before, "pairs": pairs, "seed": seed, **facts, "validation": recalls}
-    add_training(results, run)
+    add_training(results, cast(TrainingRun, run))
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, trained on {pairs:,} pairs")
 
 
@@ -80,7 +79,7 @@ def recalibrate() -> None:
     print(f"{path}: calibrated; within 5 degrees on held-out pairs: {shares}")
 
 
-def add_training(results: Path, run: dict[str, object]) -> None:
+def add_training(results: Path, run: TrainingRun) -> None:
     """Add a training run to results/register/training.json."""
     path = results / TRAINING
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -106,14 +105,13 @@ def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:
     for protocol, points in itertools.product(CALIBRATION_PROTOCOLS, CALIBRATION_PAIRS):
         pairs = held_out_pairs(protocol, CALIBRATION_PAIRS[points], seed=0, points=points)
         results = benchmark.compare(pairs, [model, "icp"])
-        per_pair = results[model].per_pair
         if points == 512:
             recalls[protocol] = results[model].recall_5deg
-        scores += zip(per_pair["agreement"], per_pair["support"], strict=True)
-        aligned += _aligned(per_pair)
+        scores += results[model].scores.tolist()
+        aligned += results[model].aligned.tolist()
         for result in results.values():
             agreements += result.per_pair["agreement"]
-            aligned_alone += _aligned(result.per_pair)
+            aligned_alone += result.aligned.tolist()
     both = _fit_logistic(np.array(scores), np.array(aligned, float))
     alone = _fit_logistic(np.array(agreements)[:, None], np.array(aligned_alone, float))
     curve = Calibration(both, alone)
@@ -123,11 +121,6 @@ def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:
         f'called "aligned": {sure.mean():.1%} of {len(sure)} held-out pairs, {wrongly:.1%} wrongly'
     )
     return {"both": both, "agreement": alone}, recalls
-
-
-def _aligned(per_pair: Mapping[str, list[float]]) -> list[bool]:
-    """Tell which of a model's pairs lie on each other."""
-    return [distance < ADDS_THRESHOLD for distance in per_pair["adds"]]
 
 
 def held_out_pairs(

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import NotRequired, TypedDict
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -9,8 +10,8 @@ from matplotlib.ticker import EngFormatter, NullLocator
 from scipy import stats
 
 from corrmat.calibration import shipped_calibration, verdict
-from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG
 from corrmat.reporting.figures import BLUE, GREEN, RED, save
+from corrmat.reporting.model_results import Comparison, ModelResult, read_comparison
 from corrmat.reporting.tables import markdown_head, markdown_row
 from corrmat.weights import shipped_metadata
 
@@ -21,20 +22,33 @@ _KINDS = {"single objects": ("shapes", "modelnet40"), "rooms": ("procedural",)} 
 _BINS = 10  # of the expected calibration error
 
 
+class TrainingRun(TypedDict):
+    """A training of the shipped weights; an entry of results/register/training.json."""
+
+    before: int  # pairs that the weights had seen when it started
+    pairs: int  # and when it ended
+    seed: NotRequired[int]  # not of the first runs
+    pairs_seen: int
+    train_seconds: float | None
+    commit: str
+    curve: list[dict[str, float]]  # on validation pairs
+    validation: dict[str, float]  # share of each protocol's held-out pairs within 5 degrees
+
+
 def comparison_summary(results: Path) -> str:
     """Build README's table: recall at 5 degrees of every model, ours with its interval."""
-    records = [r for r in _read_comparisons(results) if r["protocol"] != "rooms"]
+    records = [r for r in _read_comparisons(results) if r.protocol != "rooms"]
     if not records:
         return "No comparison is recorded; `make protocols` makes them."
-    models = list(records[0]["models"])
+    models = list(records[0].models)
     lines = markdown_head(["pairs", "data", "points", *models])
     for record in records:
         cells = []
         for model in models:
-            hits = _within_angle(record["models"][model])
+            hits = record.models[model].within_angle
             interval = f" ({_wilson(hits)})" if model == OURS else ""
             cells.append(f"{hits.mean():.0%}{interval}")
-        about = [str(record[name]) for name in ("protocol", "data", "points")]
+        about = [record.protocol, record.data, str(record.points)]
         lines.append(markdown_row([*about, *cells]))
     return "\n".join(lines)
 
@@ -48,11 +62,11 @@ def comparison_table(results: Path) -> str:
     heads = ["pairs", "data", "points", "model", "within 5 deg", "ADD-S", "p", "ms a pair"]
     lines = markdown_head(heads)
     for record in _read_comparisons(results):
-        ours = _within_angle(record["models"][OURS])
-        for model, row in record["models"].items():
-            start = [record["protocol"], record["data"], str(record["points"]), model]
-            recalls = _recall_cells(row, None if model == OURS else ours)
-            lines.append(markdown_row([*start, *recalls, f"{row['ms']:.0f}"]))
+        ours = record.models[OURS].within_angle
+        for model, result in record.models.items():
+            start = [record.protocol, record.data, str(record.points), model]
+            recalls = _recall_cells(result, None if model == OURS else ours)
+            lines.append(markdown_row([*start, *recalls, f"{result.ms:.0f}"]))
     return "\n".join(lines)
 
 
@@ -66,11 +80,11 @@ def networks_table(results: Path) -> str:
         return "No comparison is recorded."
     heads = ["network", "its record", "within 5 deg", "ADD-S", "p"]
     lines = markdown_head(heads)
-    models = json.loads(path.read_text())["models"]
-    ours = _within_angle(models[OURS])
-    for name, row in models.items():
+    models = read_comparison(path).models
+    ours = models[OURS].within_angle
+    for name, result in models.items():
         record = "" if name == OURS else shipped_metadata(name)["record"]
-        recalls = _recall_cells(row, None if name == OURS else ours)
+        recalls = _recall_cells(result, None if name == OURS else ours)
         lines.append(markdown_row([Path(name).name, record, *recalls]))
     return "\n".join(lines)
 
@@ -84,10 +98,10 @@ def families_table(results: Path) -> str:
     path = results / "register" / "held_out_families.json"
     if not path.is_file():
         return "No test is recorded."
-    tested = json.loads(path.read_text())["models"]
+    tested = read_comparison(path).models
 
     def hits(*names: str) -> np.ndarray:
-        return np.concatenate([_within_angle(tested[name]) for name in names])
+        return np.concatenate([tested[name].within_angle for name in names])
 
     unseen = hits("without first, first", "without second, second")
     trained = hits("without second, first", "without first, second")
@@ -144,11 +158,11 @@ def confidence_table(results: Path) -> str:
     for what, data_sets in _KINDS.items():
         both = []
         for data in data_sets:
-            rows = [r["models"][OURS] for r in comparisons if r["data"] == data]
-            if not rows:
+            ours = [c.models[OURS] for c in comparisons if c.data == data]
+            if not ours:
                 continue
-            promised = np.concatenate([_confidence(row) for row in rows])
-            aligned = np.concatenate([_aligned(row) for row in rows])
+            promised = np.concatenate([_confidence(result) for result in ours])
+            aligned = np.concatenate([result.aligned for result in ours])
             both.append((promised, aligned))
             verdicts = np.array([verdict(p, "").partition(":")[0] for p in promised])
             for words in ("aligned", "probably aligned", "doubtful"):
@@ -193,13 +207,13 @@ def doubling_summary(results: Path) -> str:
     )
 
 
-def training_runs(results: Path) -> list[dict]:
+def training_runs(results: Path) -> list[TrainingRun]:
     """Read how the shipped weights were trained, a run an entry; none if nothing is recorded."""
     path = results / TRAINING
     return json.loads(path.read_text()) if path.is_file() else []
 
 
-def _recall_line(runs: list[dict], protocol: str) -> tuple[float, float]:
+def _recall_line(runs: list[TrainingRun], protocol: str) -> tuple[float, float]:
     """Fit recall in per cent by a line in log2 of the pairs: slope and intercept."""
     doublings = np.log2([run["pairs"] for run in runs])
     slope, intercept = np.polyfit(doublings, [100 * r["validation"][protocol] for r in runs], 1)
@@ -238,33 +252,23 @@ def draw_training(results: Path) -> None:
     save(figure, results / "register" / "training.png")
 
 
-def _read_comparisons(results: Path) -> list[dict]:
+def _read_comparisons(results: Path) -> list[Comparison]:
     """Read the comparisons of all protocols, in the order of the tables."""
-    paths = (results / "register").glob("*-*-*.json")
-    records = [json.loads(path.read_text()) for path in paths]
-    kept = [record for record in records if record["protocol"] in _PROTOCOLS]
-    return sorted(kept, key=lambda r: (_PROTOCOLS.index(r["protocol"]), r["data"], r["points"]))
+    records = map(read_comparison, (results / "register").glob("*-*-*.json"))
+    kept = [record for record in records if record.protocol in _PROTOCOLS]
+    return sorted(kept, key=lambda r: (_PROTOCOLS.index(r.protocol), r.data, r.points))
 
 
-def _within_angle(row: dict) -> np.ndarray:
-    return np.array(row["per_pair"]["rotation_error_deg"]) < RECALL_DEG
-
-
-def _aligned(row: dict) -> np.ndarray:
-    return np.array(row["per_pair"]["adds"]) < ADDS_THRESHOLD
-
-
-def _confidence(row: dict) -> np.ndarray:
+def _confidence(result: ModelResult) -> np.ndarray:
     """Compute what the shipped calibration promised for each pair."""
     calibration = shipped_calibration()
-    scores = zip(row["per_pair"]["agreement"], row["per_pair"]["support"], strict=True)
-    return np.array([calibration.confidence(*score) for score in scores])
+    return np.array([calibration.confidence(*score) for score in result.scores])
 
 
-def _recall_cells(row: dict, ours: np.ndarray | None) -> list[str]:
+def _recall_cells(result: ModelResult, ours: np.ndarray | None) -> list[str]:
     """Format both recalls of a model with intervals, and its p value against our hits, if given."""
-    hits = _within_angle(row)
-    recalls = [f"{r.mean():.0%} ({_wilson(r)})" for r in (hits, _aligned(row))]
+    hits = result.within_angle
+    recalls = [f"{r.mean():.0%} ({_wilson(r)})" for r in (hits, result.aligned)]
     return [*recalls, "" if ours is None else f"{_mcnemar(ours, hits):.2g}"]
 
 
