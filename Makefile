@@ -16,7 +16,7 @@ OPTIONS = --scale $(SCALE) --data.data $(DATA) $(if $(ROOT),--data.root "$(ROOT)
 # What a cluster has trained anew is not trained a second time to be tested.
 RUN_OPTIONS = $(OPTIONS) $(if $(filter ray,$(LAUNCHER)),$(filter-out --fresh,$(ARGS)),$(ARGS))
 
-.PHONY: help $(EXPERIMENTS) outliers robustness all on-ray rates weights calibration checkpoints protocols docs docs-site report bench lint format test test-slow test-oldest lock clean
+.PHONY: help $(EXPERIMENTS) outliers robustness all on-ray rates weights verification calibration checkpoints protocols docs docs-site report bench lint format test test-slow test-oldest lock clean
 
 help:  ## list the targets
 	@echo "make TARGET [SCALE=smoke|laptop|overnight|paper] [DATA=shapes|modelnet40|folder] [ROOT=folder] [NAME=chairs] [ARGS='--key value']"
@@ -41,6 +41,9 @@ rates: .venv/ready  ## three learning rates for every arm, a twentieth of SCALE'
 
 weights: .venv/ready  ## train what `corrmat register` ships on the embedded shapes, put it into the package
 	$(BIN)/python reproduce/weights.py --scale $(SCALE) $(ARGS)
+
+verification: .venv/ready  ## train the network that chooses among candidates, for the weights that ship; an hour
+	$(BIN)/python reproduce/verification.py $(ARGS)
 
 calibration: .venv/ready  ## fit the confidence of the shipped weights anew (after a change of the choice, not of the weights)
 	$(BIN)/python reproduce/calibration.py

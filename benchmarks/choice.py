@@ -2,12 +2,12 @@
 
     python benchmarks/choice.py        minutes
 
-A candidate's score is agreement + a * coherence + b * unmatched loss + c * support
-(`registration/choice.py`). This tests weights and refinements on pairs of training shapes that
-no training of the network but the first saw, and writes results/register/choice.json. The weights
-in use were chosen on other pairs of these shapes. `right_matches` is how many of the network's
-matches, by weight, the true transform explains, for several numbers of anchors that its points
-attend to.
+A candidate's score is agreement + a * coherence + b * unmatched loss + c * support + d * the
+verification network's logit (`registration/choice.py`). This tests weights and refinements on
+pairs of training shapes that no training of the matching network but the first saw, and none of
+the verification network. The weights in use were chosen on other pairs of these shapes.
+`right_matches` is how many of the network's matches, by weight, the true transform explains, for
+several numbers of anchors that its points attend to. It writes results/register/choice.json.
 """
 
 import json
@@ -27,27 +27,27 @@ from corrmat.registration.choice import (
     CHOICE_WEIGHTS,
     ChoiceWeights,
     choose,
-    distinct,
     measure,
+    refine_candidates,
     refine_chosen,
 )
 from corrmat.registration.em_icp import em_icp
 from corrmat.registration.hypotheses import Hypotheses, NetworkHypotheses
 from corrmat.registration.preparation import prepare_clouds, to_original_units
-from corrmat.registration.register import CANDIDATE_STEPS, STEPS_WITHOUT_MATCHES
 from corrmat.registration.shipping import held_out_pairs
+from corrmat.registration.verification import verify
 from corrmat.revision import commit
 from corrmat.types import PairBatch
 from corrmat.weights import load_model
 
 PATH = Path(__file__).resolve().parents[1] / "results" / "register" / "choice.json"
-_COHERENCE, _UNMATCHED, _SUPPORT = CHOICE_WEIGHTS
+_COHERENCE, _UNMATCHED, _SUPPORT, _VERIFICATION = CHOICE_WEIGHTS
+_MEASURED = _COHERENCE, _UNMATCHED, _SUPPORT
 TRIED = [ChoiceWeights(*tried) for tried in (
-    (0.0, 0.0, 0.0), (1.5, 0.0, 0.0), (_COHERENCE, 0.0, 0.0), (0.0, _UNMATCHED, 0.0),
-    (0.0, 0.0, _SUPPORT), (_COHERENCE, _UNMATCHED, 0.0), CHOICE_WEIGHTS,
-    (_COHERENCE / 2, _UNMATCHED, _SUPPORT), (2 * _COHERENCE, _UNMATCHED, _SUPPORT),
-    (_COHERENCE, _UNMATCHED / 2, _SUPPORT), (_COHERENCE, 2 * _UNMATCHED, _SUPPORT),
-    (_COHERENCE, _UNMATCHED, _SUPPORT / 2), (_COHERENCE, _UNMATCHED, 2 * _SUPPORT),
+    (0.0, 0.0, 0.0, 0.0), (1.5, 0.0, 0.0, 0.0), (_COHERENCE, 0.0, 0.0, 0.0),
+    (0.0, _UNMATCHED, 0.0, 0.0), (0.0, 0.0, _SUPPORT, 0.0), (_COHERENCE, _UNMATCHED, 0.0, 0.0),
+    (*_MEASURED, 0.0), CHOICE_WEIGHTS, (*_MEASURED, _VERIFICATION / 2),
+    (*_MEASURED, 2 * _VERIFICATION), (*_MEASURED, 20 * _VERIFICATION),
 )]  # fmt: skip
 PAIRS: dict[benchmark.Protocol, int] = {"real": 200, "views": 120, "clean": 80}
 ANCHORS = 64, 256
@@ -59,6 +59,7 @@ class CandidateTables(NamedTuple):
     """What candidates are worth; the last of them is the true transform."""
 
     measures: np.ndarray  # (T + 1, 4) agreement, coherence, unmatched loss, support
+    logits: np.ndarray  # (T + 1,) of the verification network
     errors: np.ndarray  # (2, T + 1, 2) degrees and ADD-S, after generalised ICP and after EM-ICP
 
 
@@ -66,8 +67,7 @@ class PairTables(NamedTuple):
     """What a pair's candidates, and its truth, are worth."""
 
     candidates: int  # before copies are dropped
-    in_use: CandidateTables  # after as many steps of generalised ICP as `register` makes
-    more_steps: CandidateTables
+    tables: CandidateTables  # after as many steps of generalised ICP as `register` makes
     refined_truth: np.ndarray  # (2, 2) errors of the truth after EM-ICP alone, as `PRIORS`
     right_matches: list[float]  # share of the matches, by weight, for each of `ANCHORS`
 
@@ -84,20 +84,18 @@ def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> Pair
         in_units = [to_original_units(t, scale, x.centre, y.centre) for t in transforms]
         return np.array([benchmark.errors(pairs, index, t) for t in in_units])
 
-    def refined(steps: int) -> CandidateTables:
-        start = [scorer.refine(each, steps) for each in (*hypotheses.transforms, truth)]
-        candidates = np.stack([*distinct(np.stack(start[:-1])), start[-1]])
-        gicp = [scorer.refine(each) for each in candidates]
-        em = [refine_chosen(each, hypotheses, subsamples, scorer) for each in candidates]
-        return CandidateTables(
-            measure(candidates, hypotheses, subsamples, scorer),
-            np.stack([errors_of(each) for each in (gicp, em)]),
-        )
-
+    true = hypotheses._replace(transforms=truth[None])
+    refined = [refine_candidates(each, scorer) for each in (hypotheses, true)]
+    candidates = np.concatenate(refined)
+    gicp = [scorer.refine(each) for each in candidates]
+    em = [refine_chosen(each, hypotheses, subsamples, scorer) for each in candidates]
     return PairTables(
         len(hypotheses.transforms),
-        refined(CANDIDATE_STEPS),
-        refined(STEPS_WITHOUT_MATCHES),
+        CandidateTables(
+            measure(candidates, hypotheses, subsamples, scorer),
+            verify(candidates, hypotheses, subsamples),
+            np.stack([errors_of(each) for each in (gicp, em)]),
+        ),
         errors_of(em_icp(truth, *subsamples, prior) for prior in (None, hypotheses.prob)),
         [matches_of(generate, count, subsamples).support(truth, *subsamples) for count in ANCHORS],
     )
@@ -118,14 +116,16 @@ def matches_of(
 
 def outcomes(table: PairTables) -> dict[str, np.ndarray]:
     """Return the errors (2,) of one pair for all weights and refinements."""
-    measures, (gicp, em) = table.in_use
-    rows = {", ".join(map(str, tried)): em[choose(measures[:-1], tried)] for tried in TRIED}
-    name = f"in use, {STEPS_WITHOUT_MATCHES} steps of generalised ICP for each candidate"
-    more = table.more_steps
-    rows[name] = more.errors[1][choose(more.measures[:-1], CHOICE_WEIGHTS)]
+    measures, logits, (gicp, em) = table.tables
+
+    def chosen(weights: ChoiceWeights, count: int) -> int:
+        return choose(measures[:count], weights, logits.__getitem__)
+
+    found = len(measures) - 1
+    rows = {", ".join(map(str, tried)): em[chosen(tried, found)] for tried in TRIED}
     rows["best candidate"] = em[:-1].min(0)
-    rows["in use, the truth among the candidates"] = em[choose(measures, CHOICE_WEIGHTS)]
-    rows["in use, generalised ICP alone"] = gicp[choose(measures[:-1], CHOICE_WEIGHTS)]
+    rows["in use, the truth among the candidates"] = em[chosen(CHOICE_WEIGHTS, found + 1)]
+    rows["in use, generalised ICP alone"] = gicp[chosen(CHOICE_WEIGHTS, found)]
     rows["the truth, after generalised ICP"] = gicp[-1]
     for prior, errors in zip(PRIORS, table.refined_truth, strict=True):
         rows[f"the truth, after EM-ICP {prior}"] = errors
@@ -156,7 +156,7 @@ def main() -> None:
         content[protocol] = {
             "pairs": len(tables),
             "candidates": float(np.mean([table.candidates for table in tables])),
-            "distinct": float(np.mean([len(table.in_use.measures) - 1 for table in tables])),
+            "distinct": float(np.mean([len(table.tables.measures) - 1 for table in tables])),
             "weights": {name: shares([row[name] for row in rows]) for name in rows[0]},
             "right_matches": dict(zip(map(str, ANCHORS), means, strict=True)),
         }

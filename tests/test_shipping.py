@@ -8,7 +8,9 @@ from corrmat import load_model, weights
 from corrmat.calibration import shipped_calibration
 from corrmat.errors import CorrmatError
 from corrmat.methods import InvariantCorr
-from corrmat.registration import shipping
+from corrmat.registration import shipping, verification_training
+from corrmat.registration.verification_training import train_verification
+from corrmat.weights import load_verification
 
 FACTS = {"pairs_seen": 400, "train_seconds": 2.0, "commit": "abc", "curve": [{"loss": 1.0}]}
 NETWORK = {"width": 32, "heads": 2, "layers": 1, "anchors": 8, "neighbors": 4}
@@ -99,3 +101,19 @@ def test_the_calibration_finds_the_chance_that_made_the_pairs():
     scores = torch.stack([agreement, support], 1).numpy()
     fitted = torch.tensor(shipping._fit_logistic(scores, right.numpy()))
     torch.testing.assert_close(fitted, torch.tensor([6.0, 3.0, -4.0]), rtol=0.15, atol=0)
+
+
+def test_the_verification_network_is_trained_goes_on_and_ships(package, tmp_path, monkeypatch):
+    """Smoke: two steps; the second call finds the candidates made and the training done."""
+    monkeypatch.setattr(verification_training, "BATCH_PAIRS", 1)
+    options = {"runs": tmp_path / "runs", "data": "shapes", "pairs": 6, "steps": 2, "workers": 0}
+    assert load_verification(load_model()) is None
+    train_verification(**options)
+    verification = load_verification(load_model())
+    assert verification is not None
+    made = {path: path.stat().st_mtime_ns for path in (tmp_path / "runs").rglob("1-0.pt")}
+    assert len(made) == 1
+    train_verification(**options)
+    assert made == {path: path.stat().st_mtime_ns for path in made}
+    again = load_verification(load_model())
+    assert all(map(torch.equal, verification.parameters(), again.parameters()))

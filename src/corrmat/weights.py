@@ -8,6 +8,7 @@ import importlib
 import json
 import pickle
 import re
+import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -23,6 +24,7 @@ from corrmat.networks.dcp import DCPNetwork
 from corrmat.networks.invariant import InvariantNetwork
 from corrmat.networks.pcrnet import PCRNetCorrNetwork, PCRNetwork
 from corrmat.networks.rpmnet import RPMNetwork
+from corrmat.networks.verification import VerificationNetwork
 
 State = dict[str, Tensor]
 
@@ -127,6 +129,24 @@ def load_model(model: str | Path = "corrmat") -> nn.Module:
         return checkpoint_network(path)[2]
     state = _tensors(path, content)
     return load_reference(_kind_of(path, state), state)
+
+
+def load_verification(matching: nn.Module) -> VerificationNetwork | None:
+    """Load the shipped verification network, if it was trained with this matching network."""
+    path = _shipped_file("verification")
+    if not path.is_file() or shipped_metadata("verification")["verifies"] != checksum(matching):
+        return None
+    network = _load_safetensors(path)
+    assert isinstance(network, VerificationNetwork)
+    return network
+
+
+def checksum(network: nn.Module) -> str:
+    """Compute the CRC-32 of a network's tensors."""
+    value = 0
+    for tensor in network.state_dict().values():
+        value = zlib.crc32(tensor.cpu().contiguous().numpy().tobytes(), value)
+    return f"{value:08x}"
 
 
 def shipped_metadata(model: str = "corrmat") -> dict[str, str]:
@@ -234,6 +254,8 @@ def _load_safetensors(path: Path) -> nn.Module:
 def _network_type(method: str) -> type[nn.Module]:
     if method == "Invariant_corr":  # Lightning, which the others import, takes seconds
         return InvariantNetwork
+    if method == "verification":
+        return VerificationNetwork
     from corrmat.methods import METHODS
 
     return METHODS[method].network_type

@@ -1,5 +1,6 @@
 """The choice among a model's candidates, and the refinement of the chosen one."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -16,10 +17,14 @@ class ChoiceWeights(NamedTuple):
     coherence: float
     unmatched_loss: float
     support: float
+    verification: float  # the logit of the verification network, for the best of the others' sum
 
 
-CHOICE_WEIGHTS = ChoiceWeights(4.0, -1.0, 0.2)  # benchmarks/choice.py
-WITHOUT_MATCHABILITIES = ChoiceWeights(1.5, 0.0, 0.0)  # for models that have none
+CHOICE_WEIGHTS = ChoiceWeights(4.0, -1.0, 0.2, 0.05)  # benchmarks/choice.py
+WITHOUT_MATCHABILITIES = ChoiceWeights(1.5, 0.0, 0.0, 0.0)  # for models that have none
+VERIFIED = 8  # candidates at most
+CANDIDATE_STEPS = 5  # of generalised ICP, for each candidate; EM-ICP with matches does the rest
+STEPS_WITHOUT_MATCHES = 30  # the same for models that have none
 SAME_TRANSFORM = 0.1  # difference of two matrices: a turn by 4 degrees, or a shift by 0.1
 COARSE_POINTS = 400  # of each cloud, for EM-ICP's first pass
 FINE_ITERATIONS = 4  # of its second pass, on all points of a model with matches
@@ -32,6 +37,20 @@ def distinct(transforms: np.ndarray) -> np.ndarray:
         if np.linalg.norm(kept - transform, axis=(1, 2)).min() > SAME_TRANSFORM:
             kept = np.concatenate([kept, transform[None]])
     return kept
+
+
+def refine_candidates(hypotheses: Hypotheses, scorer: AlignmentScorer) -> np.ndarray:
+    """Refine the transforms of hypotheses a little by generalised ICP and drop copies.
+
+    Args:
+        hypotheses: of the model.
+        scorer: of the clouds.
+
+    Returns:
+        (T, 4, 4).
+    """
+    steps = STEPS_WITHOUT_MATCHES if hypotheses.prob is None else CANDIDATE_STEPS
+    return distinct(np.stack([scorer.refine(each, steps) for each in hypotheses.transforms]))
 
 
 def measure(
@@ -59,14 +78,25 @@ def measure(
     return np.array(rows)
 
 
-def choose(measures: np.ndarray, weights: ChoiceWeights) -> int:
+def choose(
+    measures: np.ndarray,
+    weights: ChoiceWeights,
+    verified: Callable[[np.ndarray], np.ndarray] | None,
+) -> int:
     """Choose the candidate of the highest score.
 
     Args:
         measures: (T, 4) of `measure`.
-        weights: of coherence, unmatched loss and support, beside agreement's 1.
+        weights: of coherence, unmatched loss, support and verification, beside agreement's 1.
+        verified: what `verify` says of the candidates at (n,) indices; None if nothing can.
     """
-    return int(np.argmax(measures @ [1.0, *weights]))
+    *of_measures, of_verification = weights
+    scores = measures @ [1.0, *of_measures]
+    best = np.argsort(-scores, kind="stable")[:VERIFIED]
+    if verified is not None and len(best) > 1:
+        scores[best] += of_verification * verified(best)
+        return int(best[np.argmax(scores[best])])
+    return int(best[0])
 
 
 def refine_chosen(

@@ -24,15 +24,16 @@ from corrmat.baselines import (
     kiss_matcher,
 )
 from corrmat.errors import CorrmatError
+from corrmat.networks.verification import VerificationNetwork
 from corrmat.ops import rigid
 from corrmat.ops.correspondence import MatchabilityCorrespondence, SoftCorrespondence
 from corrmat.ops.ransac import best_by_matches, best_distinct, fit_triples
 from corrmat.types import MATCH_DISTANCE
+from corrmat.weights import load_verification
 
 _STRONGEST = 256  # matches that RANSAC draws from
 _INLIER_THRESHOLD = 0.15  # largest residual of a match
-_BY_MATCHES, _BY_AGREEMENT = 16, 8  # hypotheses at most
-_RANKED = 500  # fits that are ranked by agreement
+_BY_MATCHES, _BY_AGREEMENT = 16, 40  # hypotheses at most
 _ROUGH_POINTS = 64, 256  # of source and target, to rank them by
 _ROUGH_DISTANCE = 0.3  # beyond which two points do not agree
 _MAX_UNMATCHED_NLL = 8.0  # of a point: the network may be wrong
@@ -49,6 +50,8 @@ class Hypotheses(NamedTuple):
     prob: torch.Tensor | None = None  # (N, M), probabilities of all matches
     # (N,) and (M,): -log of the probability that a source point, or a target point, has no match.
     unmatched_nll: tuple[np.ndarray, np.ndarray] | None = None
+    features: tuple[torch.Tensor, torch.Tensor] | None = None  # (N, d) and (M, d)
+    verification: VerificationNetwork | None = None  # of the network's hypotheses
 
     def unmatched_loss(self, distances: tuple[np.ndarray, np.ndarray]) -> float:
         """Compute the cross-entropy of the points that a transform leaves without a match.
@@ -113,6 +116,7 @@ class NetworkHypotheses:
 
     def __init__(self, network: nn.Module) -> None:
         self.network = network
+        self.verification = load_verification(network)
 
     @torch.no_grad()
     def __call__(self, source: np.ndarray, target: np.ndarray, seed: int) -> Hypotheses:
@@ -130,15 +134,18 @@ class NetworkHypotheses:
         weighted = x[0, i, :3], y[0, j, :3], weight.sqrt(), _INLIER_THRESHOLD
         fits = fit_triples(*weighted, generator=torch.Generator().manual_seed(seed))
         by_matches = best_by_matches(*fits, *weighted, _BY_MATCHES)
-        rotation, translation = (t[:_RANKED] for t in fits)
-        score = rough_agreement(rotation, translation, x[0], y[0])
-        best = best_distinct(rotation, score, _BY_AGREEMENT)
+        rotation, translation = fits
+        best = best_distinct(rotation, rough_agreement(*fits, x[0], y[0]), _BY_AGREEMENT)
         by_agreement = rotation[best], translation[best]
         ranked = [rigid.to_homogeneous(*fit) for fit in (by_matches, by_agreement)]
         transforms = np.concatenate([*ranked, own_transform])
         matches = torch.stack([i, j], 1).numpy()
         confidence = weight.double().numpy()
-        return Hypotheses(transforms, matches, confidence, prob, unmatched_nll(correspondence))
+        features = correspondence.feature_source[0].cpu(), correspondence.feature_target[0].cpu()
+        unmatched = unmatched_nll(correspondence)
+        return Hypotheses(
+            transforms, matches, confidence, prob, unmatched, features, self.verification
+        )
 
     def _predict(
         self, x: torch.Tensor, y: torch.Tensor

@@ -15,8 +15,8 @@ from corrmat.registration.choice import (
     CHOICE_WEIGHTS,
     WITHOUT_MATCHABILITIES,
     choose,
-    distinct,
     measure,
+    refine_candidates,
     refine_chosen,
 )
 from corrmat.registration.hypotheses import CLASSICAL, HypothesisGenerator, NetworkHypotheses
@@ -28,11 +28,10 @@ from corrmat.registration.preparation import (
 )
 from corrmat.registration.result import Registration
 from corrmat.registration.scoring import AlignmentScorer
+from corrmat.registration.verification import verify
 from corrmat.weights import load_model
 
 Refine = Literal["icp", "none"]
-CANDIDATE_STEPS = 5  # of generalised ICP, for each candidate; EM-ICP with matches does the rest
-STEPS_WITHOUT_MATCHES = 30  # the same for models that have none
 # Unrelated clouds of fewer points may lie on each other: they are "doubtful" at best.
 FEW_POINTS, FEW_CONFIDENCE = 30, 0.49
 OTHER_SIZE = 8.0  # times as large: two such clouds may have different units
@@ -86,9 +85,14 @@ def register(
 
     candidates = hypotheses.transforms
     if refine == "icp":
-        steps = STEPS_WITHOUT_MATCHES if hypotheses.prob is None else CANDIDATE_STEPS
-        candidates = distinct(np.stack([scorer.refine(t, steps) for t in candidates]))
-    transform = candidates[choose(measure(candidates, hypotheses, subsamples, scorer), weights)]
+        candidates = refine_candidates(hypotheses, scorer)
+    measures = measure(candidates, hypotheses, subsamples, scorer)
+
+    def verified(some: np.ndarray) -> np.ndarray:
+        return verify(candidates[some], hypotheses, subsamples)
+
+    verifiable = hypotheses.verification is not None
+    transform = candidates[choose(measures, weights, verified if verifiable else None)]
     full = scorer
     if max(len(x.rows), len(y.rows)) > SELECTION_POINTS:
         full = AlignmentScorer(x.points(scale, FULL_POINTS), y.points(scale, FULL_POINTS))

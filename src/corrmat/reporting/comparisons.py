@@ -130,7 +130,7 @@ def choice_table(results: Path) -> str:
         return "No choice is recorded."
     record = json.loads(path.read_text())
     protocols = [name for name in _PROTOCOLS if name in record]
-    heads = ["weights of coherence, unmatched loss, support", *protocols]
+    heads = ["weights of coherence, unmatched loss, support, verification", *protocols]
     lines = markdown_head(heads)
     for weights in record[protocols[0]]["weights"]:
         tried = [record[name]["weights"][weights] for name in protocols]

@@ -5,21 +5,19 @@ import json
 import logging
 import pickle
 import shutil
-import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
 import torch
 import yaml
-from torch import Tensor
 
 from corrmat.files import replace_text
 from corrmat.reporting.record import COMMITS
 from corrmat.training.preflight import Arm
 from corrmat.training.recipe import Recipe, Settings, default_settings, merge
-from corrmat.weights import load_model
+from corrmat.weights import checksum, load_model
 
 log = logging.getLogger("corrmat")
 _TRAINED = "trained.json"
@@ -55,16 +53,8 @@ def training_settings(arm: Arm) -> str:
     settings = _that_count(arm.settings.as_plain())
     checksums: Settings = {"data": {"checksum": arm.datamodule.clouds("train").checksum()}}
     if arm.settings.start is not None:
-        checksums["start_checksum"] = _checksum(load_model(arm.settings.start).state_dict())
+        checksums["start_checksum"] = checksum(load_model(arm.settings.start))
     return yaml.safe_dump(merge(settings, checksums), sort_keys=False)
-
-
-def _checksum(state: Mapping[str, Tensor]) -> str:
-    """Compute the CRC-32 of a network's tensors."""
-    value = 0
-    for tensor in state.values():
-        value = zlib.crc32(tensor.cpu().contiguous().numpy().tobytes(), value)
-    return f"{value:08x}"
 
 
 def _that_count(settings: Settings) -> Settings:

@@ -1,0 +1,11 @@
+"""The network that verifies the candidates of `corrmat register`: trained, put into the package.
+
+It belongs to the matching weights that ship: after `make weights` it is trained anew.
+"""
+
+from jsonargparse import auto_cli
+
+from corrmat.registration.verification_training import train_verification
+
+if __name__ == "__main__":
+    auto_cli(train_verification)

@@ -1,0 +1,195 @@
+"""Training of the verification network, on the candidates of the shipped weights.
+
+Every training pair has new shapes and is registered up to its candidates. Of those of a pair, the
+network learns which are right, by the cross-entropy over them; the true transform, refined like a
+candidate, is among them. A candidate that is as good as the right one, for a symmetric thing, does
+not count.
+"""
+
+import functools
+import multiprocessing
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import lightning as L
+import numpy as np
+import torch
+from lightning.pytorch.callbacks import ModelCheckpoint
+from rich.progress import track
+from torch import Tensor
+from torch.utils.data import DataLoader
+
+from corrmat import weights
+from corrmat.data.datamodule import PairDataset, RegistrationDataModule
+from corrmat.networks.verification import VerificationNetwork
+from corrmat.ops import rigid
+from corrmat.registration import benchmark
+from corrmat.registration.choice import refine_candidates
+from corrmat.registration.hypotheses import NetworkHypotheses
+from corrmat.registration.preparation import prepare_clouds, to_original_units
+from corrmat.registration.shipping import recalibrate
+from corrmat.registration.verification import evidence
+from corrmat.revision import commit
+from corrmat.types import PairBatch
+
+SIZES = 512, 560, 640, 768, 1024  # points of a cloud before it is cropped
+PROTOCOLS: tuple[benchmark.Protocol, ...] = ("real", "views", "real", "views", "real", "clean")
+STRETCH = 1.4
+SHARD_PAIRS = 100
+WRONG = 8  # candidates of a pair that are kept at most, besides the truth
+RIGHT, AS_GOOD = 0.15, 0.05  # mean distance of a right transform's points, and ADD-S of one as good
+BATCH_PAIRS = 8
+RATE = 2e-3
+
+
+class CandidateSet(NamedTuple):
+    """The candidates of one pair."""
+
+    features: Tensor  # (P, d) float16
+    evidence: Tensor  # (T, P, EVIDENCE) float16
+    nearest: Tensor  # (T, P) int16
+    right: Tensor  # (T,) bool
+
+
+def train_verification(
+    runs: Path = Path("runs"),
+    data: str = "shapes+assemblies+rooms",
+    pairs: int = 9000,
+    steps: int = 8000,
+    seed: int = 1,
+    workers: int = 2,
+) -> None:
+    """Train the network that verifies the candidates of `corrmat register`, and ship it.
+
+    The same command again goes on where it stopped. The confidence is fitted anew at the end.
+
+    Args:
+        runs: folder of candidates and checkpoints.
+        data: generated shapes, a new one for every pair.
+        pairs: to register, up to their candidates.
+        steps: of training, eight pairs each.
+        seed: of the pairs and of the network.
+        workers: processes that make candidates; 0 makes them in this one.
+    """
+    folder = runs / "verification"
+    shards = {number: folder / f"{seed}-{number}.pt" for number in range(-(-pairs // SHARD_PAIRS))}
+    missing = {number: path for number, path in shards.items() if not path.is_file()}
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers or 1, spawn, torch.set_num_threads, (1,)) as pool:
+        write = functools.partial(write_shard, data=data, seed=seed, count=min(pairs, SHARD_PAIRS))
+        written = (pool.map if workers else map)(write, missing.values(), missing)
+        for _ in track(written, "candidates", len(missing), transient=True):
+            pass
+    sets = [CandidateSet(*content) for path in shards.values() for content in torch.load(path)]
+    useful = [each for each in sets if 0 < each.right.sum() < len(each.right)]
+    print(f"{len(useful):,} of {len(sets):,} pairs have right and wrong candidates")
+    L.seed_everything(seed, verbose=False)
+    module = VerificationTraining(steps)
+    loader = DataLoader(
+        useful,  # pyright: ignore[reportArgumentType] (a list is a data set)
+        BATCH_PAIRS,
+        shuffle=True,
+        drop_last=True,
+        collate_fn=list,
+    )
+    checkpoints = folder / f"{seed}-{pairs}-{steps}"
+    trainer = L.Trainer(
+        max_steps=steps, max_epochs=-1, logger=False, enable_model_summary=False,
+        gradient_clip_val=1.0,
+        callbacks=[ModelCheckpoint(checkpoints, every_n_train_steps=200, save_last=True)],
+    )  # fmt: skip
+    last = checkpoints / "last.ckpt"
+    trainer.fit(module, loader, ckpt_path=last if last.is_file() else None)
+    about = {"verifies": weights.checksum(weights.load_model()), "pairs": str(len(useful))}
+    about |= {"seed": str(seed), "commit": str(commit())}
+    path = weights.ship_network("verification", "verification", {}, module.network, **about)
+    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
+    recalibrate()
+
+
+def write_shard(path: Path, number: int, *, data: str, seed: int, count: int) -> None:
+    """Make the candidates of `count` pairs of one size and write them to a file."""
+    size = SIZES[number % len(SIZES)]
+    clouds = RegistrationDataModule(data, new_shapes=True, seed=seed).clouds("train")
+    rng = np.random.default_rng((seed, number))
+    generate = NetworkHypotheses(weights.load_model())
+    sets = []
+    for index in range(count):
+        protocol = PROTOCOLS[index % len(PROTOCOLS)]
+        settings = replace(benchmark.PROTOCOLS[protocol], num_points=size, stretch=STRETCH)
+        dataset = PairDataset(clouds, settings, seed, "train", new_shapes=True)
+        pair = dataset[number * SHARD_PAIRS + index, int(rng.integers(len(clouds)))]
+        sets.append(tuple(candidate_set(pair, generate, rng)))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    torch.save(sets, path.with_suffix(".part"))
+    path.with_suffix(".part").rename(path)
+
+
+def candidate_set(
+    pairs: PairBatch, generate: NetworkHypotheses, rng: np.random.Generator
+) -> CandidateSet:
+    """Register a pair, a batch of one, up to its candidates, and label them."""
+    source, target = (c[0].double().numpy() for c in (pairs.source, pairs.target))
+    (x, y), scale, subsamples, scorer = prepare_clouds(source, target, 0)
+    hypotheses = generate(*subsamples, 0)
+    rotation, shift = pairs.rotation[0].double().numpy(), pairs.translation[0].double().numpy()
+    truth = rigid.to_homogeneous(rotation, scale * (rotation @ x.centre + shift - y.centre))
+    found = refine_candidates(hypotheses, scorer)
+    true = refine_candidates(hypotheses._replace(transforms=truth[None]), scorer)
+    transforms = np.concatenate([found[rng.permutation(len(found))[:WRONG]], true])
+    points = subsamples[0][:, :3]
+    offsets = points @ (transforms - truth)[:, :3, :3].transpose(0, 2, 1)
+    offsets += (transforms - truth)[:, None, :3, 3]
+    right = np.linalg.norm(offsets, axis=2).mean(1) < RIGHT
+    original = [to_original_units(each, scale, x.centre, y.centre) for each in transforms]
+    adds = np.array([benchmark.errors(pairs, 0, each)[1] for each in original])
+    counts = right | (adds > AS_GOOD)
+    features, seen, nearest = evidence(transforms[counts], hypotheses, subsamples)
+    labels = torch.from_numpy(right[counts])
+    return CandidateSet(features.half(), seen.half(), nearest.short(), labels)
+
+
+class VerificationTraining(L.LightningModule):
+    """Cross-entropy of the right candidates among those of a pair.
+
+    Args:
+        steps: of the training, for the rate's one cycle.
+    """
+
+    def __init__(self, steps: int) -> None:
+        super().__init__()
+        self.steps = steps
+        self.network = VerificationNetwork()
+
+    def training_step(self, batch: Sequence[CandidateSet], index: int) -> Tensor:
+        """Compute the loss of some pairs, each turned at random."""
+        seen = torch.cat([_turned(each.evidence.float()) for each in batch])
+        nearest = torch.cat([each.nearest.long() for each in batch])
+        features = torch.cat(
+            [each.features.float().expand(len(each.right), -1, -1) for each in batch]
+        )
+        with torch.autocast(seen.device.type, torch.bfloat16):
+            score = self.network(features, seen, nearest)
+        scores = score.float().split([len(each.right) for each in batch])
+        losses = [
+            torch.logsumexp(own, 0) - torch.logsumexp(own[each.right], 0)
+            for own, each in zip(scores, batch, strict=True)
+        ]
+        loss = torch.stack(losses).mean()
+        self.log("loss", loss, prog_bar=True, batch_size=len(batch))
+        return loss
+
+    def configure_optimizers(self) -> dict[str, object]:
+        """AdamW, one cycle of the rate."""
+        optimizer = torch.optim.AdamW(self.network.parameters(), RATE, weight_decay=1e-2)
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, self.steps, pct_start=0.05)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+
+def _turned(seen: Tensor) -> Tensor:
+    """Turn or mirror the positions of all points (T, P, EVIDENCE) alike."""
+    turn = torch.linalg.qr(torch.randn(3, 3))[0]
+    return torch.cat([seen[..., :-3], seen[..., -3:] @ turn], -1)
