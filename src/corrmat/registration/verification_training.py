@@ -8,6 +8,7 @@ not count.
 
 import functools
 import multiprocessing
+import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
@@ -58,7 +59,7 @@ def train_verification(
     runs: Path = Path("runs"),
     data: str = "shapes+assemblies+rooms",
     pairs: int = 9000,
-    steps: int = 8000,
+    steps: int = 5000,
     seed: int = 1,
     workers: int = 2,
 ) -> None:
@@ -97,9 +98,12 @@ def train_verification(
     )
     checkpoints = folder / f"{seed}-{pairs}-{steps}"
     trainer = L.Trainer(
-        max_steps=steps, max_epochs=-1, logger=False, enable_model_summary=False,
-        gradient_clip_val=1.0,
-        callbacks=[ModelCheckpoint(checkpoints, every_n_train_steps=200, save_last=True)],
+        max_steps=steps, max_epochs=-1, accelerator="cpu", logger=False,
+        enable_model_summary=False, enable_progress_bar=False, gradient_clip_val=1.0,
+        callbacks=[
+            ModelCheckpoint(checkpoints, every_n_train_steps=200, save_last=True),
+            PrintLoss(),
+        ],
     )  # fmt: skip
     last = checkpoints / "last.ckpt"
     trainer.fit(module, loader, ckpt_path=last if last.is_file() else None)
@@ -187,6 +191,29 @@ class VerificationTraining(L.LightningModule):
         optimizer = torch.optim.AdamW(self.network.parameters(), RATE, weight_decay=1e-2)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, self.steps, pct_start=0.05)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+
+class PrintLoss(L.Callback):
+    """A line of progress every hundred steps: mean loss, and the seconds that are left."""
+
+    def __init__(self) -> None:
+        self.losses: list[float] = []
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Start the clock."""
+        self.start, self.first = time.perf_counter(), trainer.global_step
+
+    def on_train_batch_end(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: dict, *_: object
+    ) -> None:
+        """Count a step."""
+        self.losses.append(float(outputs["loss"]))
+        step = trainer.global_step
+        if step % 100 == 0:
+            left = (time.perf_counter() - self.start) / (step - self.first)
+            left *= trainer.max_steps - step
+            print(f"step {step:,}  loss {np.mean(self.losses):.3f}  {left:,.0f} s left", flush=True)
+            self.losses.clear()
 
 
 def _turned(seen: Tensor) -> Tensor:
