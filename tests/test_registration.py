@@ -37,6 +37,7 @@ from corrmat.registration.hypotheses import (
 )
 from corrmat.registration.scene import build_scene, extent
 from corrmat.registration.scoring import AlignmentScorer
+from corrmat.registration.verification import verify
 from corrmat.registration.view import registration_page
 from corrmat.types import Prediction
 from corrmat.weights import load_model
@@ -465,9 +466,12 @@ def test_the_authors_checkpoint_registers(pair):
 def test_shipped_weights_are_small_and_hold_no_pickle():
     from corrmat.weights import SHIPPED
 
-    content = SHIPPED.read_bytes()
-    assert len(content) < 8e6
-    assert content[8:9] == b"{"  # safetensors: a length, then JSON
+    files = list(SHIPPED.parent.glob("*.safetensors"))
+    assert len(files) == 2  # of matching and of verification
+    for file in files:
+        content = file.read_bytes()
+        assert len(content) < 8e6
+        assert content[8:9] == b"{"  # safetensors: a length, then JSON
 
 
 def _frame(animation, at):
@@ -689,9 +693,24 @@ def test_only_a_network_with_matchabilities_says_which_points_have_no_match(gene
 
 def test_the_candidate_of_the_largest_weighted_sum_is_chosen():
     measures = np.array([[0.5, 0.1, 0.1, 0.5], [0.6, 0.1, 0.5, 0.2], [0.5, 0.1, 0.1, 0.5]])
-    assert choice.choose(measures, (0.0, 0.0, 0.0)) == 1
-    assert choice.choose(measures, (0.0, -1.0, 0.0)) == 0  # the first of two equal ones
-    assert choice.choose(measures, (0.0, 0.0, 0.5)) == 0
+    assert choice.choose(measures, (0.0, 0.0, 0.0, 0.0), None) == 1
+    assert choice.choose(measures, (0.0, -1.0, 0.0, 0.0), None) == 0  # the first of two equal ones
+    assert choice.choose(measures, (0.0, 0.0, 0.5, 0.0), None) == 0
+
+
+def test_the_verification_network_is_asked_for_the_best_candidates_alone(monkeypatch):
+    monkeypatch.setattr(choice, "VERIFIED", 2)
+    measures = np.array([[0.5, 0, 0, 0], [0.6, 0, 0, 0], [0.1, 0, 0, 0]])
+    logits, asked = np.array([1.0, -1.0, 9.0]), []
+
+    def verified(some):
+        asked.append(set(some.tolist()))
+        return logits[some]
+
+    assert choice.choose(measures, (0.0, 0.0, 0.0, 1.0), verified) == 0
+    assert choice.choose(measures, (0.0, 0.0, 0.0, 0.01), verified) == 1
+    assert choice.choose(measures[:1], (0.0, 0.0, 0.0, 1.0), verified) == 0
+    assert asked == [{0, 1}] * 2  # one candidate needs no choice
 
 
 def test_a_transform_that_is_nearly_an_earlier_one_is_dropped():
@@ -714,6 +733,8 @@ def test_the_choice_is_by_agreement_coherence_unmatched_loss_and_support(pair):
     transforms = np.stack([rigid.to_homogeneous(rotation, shift)] * 2)
     transforms[0, :3, :3] @= np.diag([-1.0, -1.0, 1.0])
     wrong, right = choice.measure(transforms, hypotheses, subsamples, scorer)
-    better = np.sign([1.0, *choice.CHOICE_WEIGHTS]) * (right - wrong)
+    better = np.sign([1.0, *choice.CHOICE_WEIGHTS[:-1]]) * (right - wrong)
     assert (better[[0, 2, 3]] > 0).all()
-    assert choice.choose(np.stack([wrong, right]), choice.CHOICE_WEIGHTS) == 1
+    assert choice.choose(np.stack([wrong, right]), choice.CHOICE_WEIGHTS, None) == 1
+    wrongly, rightly = verify(transforms, hypotheses, subsamples)
+    assert rightly > wrongly

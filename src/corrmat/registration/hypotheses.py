@@ -33,7 +33,7 @@ from corrmat.weights import load_verification
 
 _STRONGEST = 256  # matches that RANSAC draws from
 _INLIER_THRESHOLD = 0.15  # largest residual of a match
-_BY_MATCHES, _BY_AGREEMENT = 16, 40  # hypotheses at most
+_BY_MATCHES, _BY_AGREEMENT = 16, 24  # hypotheses at most
 _ROUGH_POINTS = 64, 256  # of source and target, to rank them by
 _ROUGH_DISTANCE = 0.3  # beyond which two points do not agree
 _MAX_UNMATCHED_NLL = 8.0  # of a point: the network may be wrong
@@ -212,7 +212,9 @@ def rough_agreement(
     normals = source[:, 3:6] @ rotation.mT
     # No point within the distance: the distance is infinite, and the index one past the last.
     tree = KDTree(target[:, :3].numpy())
-    distance, nearest = tree.query(moved.numpy(), distance_upper_bound=_ROUGH_DISTANCE)
+    distance, nearest = tree.query(
+        moved.numpy(), distance_upper_bound=_ROUGH_DISTANCE, workers=torch.get_num_threads()
+    )
     closeness = np.clip(1 - (distance / _ROUGH_DISTANCE) ** 2, 0, None)
     nearest_normals = target[np.minimum(nearest, len(target) - 1), 3:6]
     parallel = (normals * nearest_normals).sum(-1).abs()
