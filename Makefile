@@ -72,7 +72,7 @@ report: .venv/ready  ## report.html: every record on one page
 	$(BIN)/corrmat report -o report.html
 
 bench: .venv/ready  ## speed: pairs a second, training steps, ratios against a naive twin
-	$(BIN)/python benchmarks/bench.py
+	$(BIN)/python benchmarks/bench.py $(ARGS)
 
 lint: .venv/ready docs-site  ## ruff, pyright, codespell, the order of imports, and the links of the site
 	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/pyright && $(BIN)/lint-imports && $(BIN)/codespell

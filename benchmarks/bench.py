@@ -1,6 +1,7 @@
 """Speed and memory of what costs, beside naive twins, and how both grow with the clouds.
 
-    make bench        a table on the screen, results/bench/bench.json and results/bench/growth.png
+    make bench                  a table on the screen, results/bench/bench.json and growth.png
+    make bench ARGS=register    the two rows of `corrmat register` alone, into the last bench.json
 
 Times are medians after a warm-up (growth above 4096 points: the first step's); memory is the
 peak of a process of its own above what it held before its first step. A ratio says how many times
@@ -83,6 +84,7 @@ STEPS: tuple[tuple[str, dict[str, Any], int, int], ...] = (
 )
 COMPILED = (STEPS[0],)
 POINTS = (256, 512, 1024, 2048, 4096, 8192)
+RECORD = ROOT / "results" / "bench" / "bench.json"
 GROWTH = {"DCP_corr, a step": POINTS, "RPMNet_corr, a step": POINTS, "loss and pose": POINTS}
 
 
@@ -120,8 +122,8 @@ def main() -> None:
     for method in ("DCP_corr", "RPMNet_corr", "PCRNet_corr"):
         add(f"one pair through {method}, N=1024", in_a_process(inference, method))
     add("one pair through FPFH + RANSAC, N=1024", in_a_process(classical, "ransac"))
-    add("corrmat.register, two clouds of 1,024 points", in_a_process(registered_pair))
-    add("corrmat register, the example, from a cold start", in_a_process(cold_start))
+    for what, measure in REGISTRATION.items():
+        add(what, in_a_process(measure))
     for name in TWINS:
         add(name, in_a_process(against_twin, name))
     for n in (512, 2048, 8192):
@@ -142,17 +144,33 @@ def main() -> None:
             arms = {arm: in_a_process(minutes_of, path, arm) for arm in recipe.arms}
             recipes[recipe.id] = arms
             print(f"minutes of {recipe.id} at laptop scale: {arms}", flush=True)
-    place = ROOT / "results" / "bench"
-    place.mkdir(parents=True, exist_ok=True)
-    about = {
+    RECORD.parent.mkdir(parents=True, exist_ok=True)
+    about = machine()
+    content = {**about, "rows": rows, "growth": growth, "exponents": exponents, "recipes": recipes}
+    replace_text(RECORD, json.dumps(content, indent=1) + "\n")
+    draw(growth, exponents, RECORD.with_name("growth.png"))
+    print(f"written: {RECORD.relative_to(ROOT)}, growth.png")
+
+
+def measure_registration() -> None:
+    """Measure the rows of `corrmat register` alone, and put them into the record."""
+    content = json.loads(RECORD.read_text())
+    if {name: content[name] for name in machine()} != machine():
+        sys.exit(f"{RECORD.relative_to(ROOT)} is of another machine: make bench measures all rows")
+    for row in content["rows"]:
+        if row["what"] in REGISTRATION:
+            row |= in_a_process(REGISTRATION[row["what"]])
+            print(row, flush=True)
+    replace_text(RECORD, json.dumps(content, indent=1) + "\n")
+
+
+def machine() -> dict[str, object]:
+    """Return what times depend on."""
+    return {
         "threads": torch.get_num_threads(),
         "instructions": torch.backends.cpu.get_cpu_capability(),
         "torch": torch.__version__,
     }
-    content = {**about, "rows": rows, "growth": growth, "exponents": exponents, "recipes": recipes}
-    replace_text(place / "bench.json", json.dumps(content, indent=1) + "\n")
-    draw(growth, exponents, place / "growth.png")
-    print(f"written: {place.relative_to(ROOT)}/bench.json, growth.png")
 
 
 def step_name(method: str, hparams: dict[str, Any], n: int, batch: int) -> str:
@@ -337,6 +355,12 @@ def cold_start() -> Row:
         ]
         ours, torch_alone = median(works, 5)
     return {"ms": round(1e3 * ours), "import_torch_ms": round(1e3 * torch_alone)}
+
+
+REGISTRATION = {
+    "corrmat.register, two clouds of 1,024 points": registered_pair,
+    "corrmat register, the example, from a cold start": cold_start,
+}
 
 
 def against_twin(name: str) -> Row:
@@ -583,4 +607,6 @@ def median(works: Sequence[Callable[[], object]], repeats: int, warm: bool = Tru
 
 
 if __name__ == "__main__":
-    main()
+    if sys.argv[1:] not in ([], ["register"]):
+        sys.exit(__doc__)
+    measure_registration() if sys.argv[1:] else main()

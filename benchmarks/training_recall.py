@@ -3,8 +3,8 @@
     python benchmarks/training_recall.py        minutes
 
 git keeps the weights of earlier runs of `make weights`. All are tested on the same held-out pairs,
-with the candidates, choice and refinement of today; `validation` in results/register/training.json
-is written anew.
+with the candidates, choice and refinement of today, but without the verification network, which
+belongs to the newest weights alone; `validation` in results/register/training.json is written anew.
 """
 
 import itertools
@@ -16,7 +16,7 @@ from pathlib import Path
 import safetensors
 
 from corrmat.files import replace_text
-from corrmat.registration import benchmark
+from corrmat.registration import benchmark, hypotheses
 from corrmat.registration.shipping import (
     CALIBRATION_PAIRS,
     CALIBRATION_PROTOCOLS,
@@ -53,6 +53,7 @@ def extract_weights(folder: Path) -> dict[int, Path]:
 def main() -> None:
     """Test all networks and write their recalls."""
     runs = json.loads(TRAINING.read_text())
+    hypotheses.load_verification = lambda _: None
     tests = {
         protocol: held_out_pairs(protocol, CALIBRATION_PAIRS[POINTS], 0, POINTS)
         for protocol in CALIBRATION_PROTOCOLS
