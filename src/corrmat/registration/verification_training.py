@@ -1,9 +1,9 @@
 """Training of the verification network, on the candidates of the shipped weights.
 
-Every training pair has new shapes and is registered up to its candidates. Of those of a pair, the
-network learns which are right, by the cross-entropy over them; the true transform, refined like a
-candidate, is among them. A candidate that is as good as the right one, for a symmetric thing, does
-not count.
+Every training pair has a new shape and is registered up to its candidates. The network learns which
+of a pair's candidates are right, by the cross-entropy over them; the true transform, refined like
+a candidate, is among them. A wrong candidate that is as good as the right one, for a symmetric
+thing, does not count.
 """
 
 import functools
@@ -75,7 +75,8 @@ def train_verification(
         seed: of the pairs and of the network.
         workers: processes that make candidates; 0 makes them in this one.
     """
-    folder = runs / "verification"
+    verified = weights.checksum(weights.load_model())
+    folder = runs / f"verification-{verified}"
     shards = {number: folder / f"{seed}-{number}.pt" for number in range(-(-pairs // SHARD_PAIRS))}
     missing = {number: path for number, path in shards.items() if not path.is_file()}
     spawn = multiprocessing.get_context("spawn")
@@ -107,9 +108,10 @@ def train_verification(
     )  # fmt: skip
     last = checkpoints / "last.ckpt"
     trainer.fit(module, loader, ckpt_path=last if last.is_file() else None)
-    about = {"verifies": weights.checksum(weights.load_model()), "pairs": str(len(useful))}
-    about |= {"seed": str(seed), "commit": str(commit())}
-    path = weights.ship_network("verification", "verification", {}, module.network, **about)
+    path = weights.ship_network(
+        "verification", "verification", {}, module.network,
+        verifies=verified, pairs=str(len(useful)), seed=str(seed), commit=str(commit()),
+    )  # fmt: skip
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
     recalibrate()
 
