@@ -122,7 +122,9 @@ def outcomes(table: PairTables) -> dict[str, np.ndarray]:
         return choose(measures[:count], weights, logits.__getitem__)
 
     found = len(measures) - 1
-    rows = {", ".join(map(str, tried)): em[chosen(tried, found)] for tried in TRIED}
+    rows = {
+        ", ".join(f"{weight:g}" for weight in tried): em[chosen(tried, found)] for tried in TRIED
+    }
     rows["best candidate"] = em[:-1].min(0)
     rows["in use, the truth among the candidates"] = em[chosen(CHOICE_WEIGHTS, found + 1)]
     rows["in use, generalised ICP alone"] = gicp[chosen(CHOICE_WEIGHTS, found)]
