@@ -553,8 +553,8 @@ def test_the_last_title_of_an_animation_fits_into_it(pair):
 @pytest.mark.parametrize(
     ("confidence", "words"),
     [
-        (0.93, "aligned"),
-        (0.92, "probably aligned: why"),
+        (0.94, "aligned"),
+        (0.93, "probably aligned: why"),
         (0.5, "probably aligned: why"),
         (0.49, "doubtful: why"),
     ],
