@@ -33,7 +33,7 @@ from corrmat.registration.choice import (
 )
 from corrmat.registration.em_icp import em_icp
 from corrmat.registration.hypotheses import Hypotheses, NetworkHypotheses
-from corrmat.registration.preparation import prepare_clouds, to_original_units
+from corrmat.registration.preparation import from_original_units, prepare_clouds, to_original_units
 from corrmat.registration.shipping import held_out_pairs
 from corrmat.registration.verification import verify
 from corrmat.revision import commit
@@ -77,8 +77,8 @@ def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> Pair
     source, target = (c[index].double().numpy() for c in (pairs.source, pairs.target))
     (x, y), scale, subsamples, scorer = prepare_clouds(source, target, 0)
     hypotheses = generate(*subsamples, 0)
-    rotation, translation = pairs.rotation[index].double().numpy(), pairs.translation[index].numpy()
-    truth = rigid.to_homogeneous(rotation, scale * (rotation @ x.centre + translation - y.centre))
+    truth = rigid.to_homogeneous(pairs.rotation[index], pairs.translation[index])
+    truth = from_original_units(truth, scale, x.centre, y.centre)
 
     def errors_of(transforms: Iterable[np.ndarray]) -> np.ndarray:
         in_units = [to_original_units(t, scale, x.centre, y.centre) for t in transforms]

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 import corrmat
 from corrmat.baselines import fpfh_ransac
-from corrmat.calibration import verdict
+from corrmat.calibration import SURE, verdict
 from corrmat.cli import main
 from corrmat.data.normals import estimate_normals
 from corrmat.data.scans import read_scan, write_ply
@@ -26,6 +26,7 @@ from corrmat.errors import CorrmatError
 from corrmat.methods import InvariantCorr
 from corrmat.ops import rigid
 from corrmat.ops.correspondence import MatchabilityCorrespondence, SoftCorrespondence
+from corrmat.options import REGISTER_EPILOG
 from corrmat.registration import choice, example, preparation, result
 from corrmat.registration import register as registration
 from corrmat.registration.animation import _title, registration_gif
@@ -563,6 +564,12 @@ def test_a_verdict_is_a_confidence_in_words(confidence, words):
     assert verdict(confidence, "why") == words
 
 
+def test_the_help_and_the_document_name_the_confidence_of_aligned():
+    assert f'"aligned" from a confidence of {SURE:.0%}'.replace("%", " %") in REGISTER_EPILOG
+    document = (Path(__file__).parents[1] / "docs" / "register.md").read_text()
+    assert f'From {SURE} on the verdict is "aligned"' in document
+
+
 def test_a_network_of_ones_own_registers():
     cloud = make_shape(("test", 3))[0][:200, :3].astype(float)
     network = load_model()
@@ -728,9 +735,10 @@ def test_the_choice_is_by_agreement_coherence_unmatched_loss_and_support(pair):
     _, source, target, truth = pair
     (x, y), scale, subsamples, scorer = preparation.prepare_clouds(source, target, 0)
     hypotheses = NetworkHypotheses(load_model())(*subsamples, 0)
-    rotation = truth[:3, :3]
-    shift = scale * (rotation @ x.centre + truth[:3, 3] - y.centre)
-    transforms = np.stack([rigid.to_homogeneous(rotation, shift)] * 2)
+    prepared = preparation.from_original_units(truth, scale, x.centre, y.centre)
+    back = preparation.to_original_units(prepared, scale, x.centre, y.centre)
+    np.testing.assert_allclose(back, truth, atol=1e-9)
+    transforms = np.stack([prepared] * 2)
     transforms[0, :3, :3] @= np.diag([-1.0, -1.0, 1.0])
     wrong, right = choice.measure(transforms, hypotheses, subsamples, scorer)
     better = np.sign([1.0, *choice.CHOICE_WEIGHTS[:-1]]) * (right - wrong)

@@ -92,7 +92,7 @@ Files: PLY, OBJ, STL, OFF, GLB, GLTF (meshes are sampled, scenes merged), PCD, X
 ASC, PTS, NPY, NPZ. Both files must have the same unit, whichever it is. Parts may be missing
 from either.
 
-verdict: "aligned" from a confidence of 93 % on, "probably aligned" from 50 %, else "doubtful".
+verdict: "aligned" from a confidence of 94 % on, "probably aligned" from 50 %, else "doubtful".
 It holds for single objects. In rooms a confident verdict is often wrong: look at --html, and
 compare with --model kiss.
 exit codes: 0 done, whatever the verdict; 2 a file cannot be used, and one line says why."""

@@ -152,3 +152,13 @@ def to_original_units(
     converted = transform.copy()
     converted[:3, 3] = centre_y + transform[:3, 3] / scale - transform[:3, :3] @ centre_x
     return converted
+
+
+def from_original_units(
+    transform: np.ndarray, scale: float, centre_x: np.ndarray, centre_y: np.ndarray
+) -> np.ndarray:
+    """Convert a transform of the user's coordinates to centred, scaled clouds."""
+    converted = transform.copy()
+    rotation, translation = transform[:3, :3], transform[:3, 3]
+    converted[:3, 3] = scale * (rotation @ centre_x + translation - centre_y)
+    return converted

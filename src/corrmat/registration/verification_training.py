@@ -30,7 +30,7 @@ from corrmat.ops import rigid
 from corrmat.registration import benchmark
 from corrmat.registration.choice import refine_candidates
 from corrmat.registration.hypotheses import NetworkHypotheses
-from corrmat.registration.preparation import prepare_clouds, to_original_units
+from corrmat.registration.preparation import from_original_units, prepare_clouds, to_original_units
 from corrmat.registration.shipping import recalibrate
 from corrmat.registration.verification import evidence
 from corrmat.revision import commit
@@ -141,8 +141,8 @@ def candidate_set(
     source, target = (c[0].double().numpy() for c in (pairs.source, pairs.target))
     (x, y), scale, subsamples, scorer = prepare_clouds(source, target, 0)
     hypotheses = generate(*subsamples, 0)
-    rotation, shift = pairs.rotation[0].double().numpy(), pairs.translation[0].double().numpy()
-    truth = rigid.to_homogeneous(rotation, scale * (rotation @ x.centre + shift - y.centre))
+    truth = rigid.to_homogeneous(pairs.rotation[0], pairs.translation[0])
+    truth = from_original_units(truth, scale, x.centre, y.centre)
     found = refine_candidates(hypotheses, scorer)
     true = refine_candidates(hypotheses._replace(transforms=truth[None]), scorer)
     transforms = np.concatenate([found[rng.permutation(len(found))[:WRONG]], true])
