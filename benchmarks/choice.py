@@ -25,11 +25,13 @@ from corrmat.ops import rigid
 from corrmat.registration import benchmark
 from corrmat.registration.choice import (
     CHOICE_WEIGHTS,
+    Candidates,
     ChoiceWeights,
     choose,
+    find_candidates,
     measure,
-    refine_candidates,
     refine_chosen,
+    refine_some,
 )
 from corrmat.registration.em_icp import em_icp
 from corrmat.registration.hypotheses import Hypotheses, NetworkHypotheses
@@ -58,6 +60,7 @@ _SEED = 5  # of pairs that nothing else uses
 class CandidateTables(NamedTuple):
     """What candidates are worth; the last of them is the true transform."""
 
+    transforms: np.ndarray  # (T + 1, 4, 4)
     measures: np.ndarray  # (T + 1, 4) agreement, coherence, unmatched loss, support
     logits: np.ndarray  # (T + 1,) of the verification network
     errors: np.ndarray  # (2, T + 1, 2) degrees and ADD-S, after generalised ICP and after EM-ICP
@@ -67,7 +70,7 @@ class PairTables(NamedTuple):
     """What a pair's candidates, and its truth, are worth."""
 
     candidates: int  # before copies are dropped
-    tables: CandidateTables  # after as many steps of generalised ICP as `register` makes
+    tables: CandidateTables  # of the candidates that `register` chooses from
     refined_truth: np.ndarray  # (2, 2) errors of the truth after EM-ICP alone, as `PRIORS`
     right_matches: list[float]  # share of the matches, by weight, for each of `ANCHORS`
 
@@ -84,14 +87,15 @@ def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> Pair
         in_units = [to_original_units(t, scale, x.centre, y.centre) for t in transforms]
         return np.array([benchmark.errors(pairs, index, t) for t in in_units])
 
-    true = hypotheses._replace(transforms=truth[None])
-    refined = [refine_candidates(each, scorer) for each in (hypotheses, true)]
-    candidates = np.concatenate(refined)
+    found = find_candidates(hypotheses, CHOICE_WEIGHTS, subsamples, scorer)
+    true = refine_some(truth[None], hypotheses, scorer)
+    candidates = np.concatenate([found.transforms, true])
     gicp = [scorer.refine(each) for each in candidates]
     em = [refine_chosen(each, hypotheses, subsamples, scorer) for each in candidates]
     return PairTables(
         len(hypotheses.transforms),
         CandidateTables(
+            candidates,
             measure(candidates, hypotheses, subsamples, scorer),
             verify(candidates, hypotheses, subsamples),
             np.stack([errors_of(each) for each in (gicp, em)]),
@@ -116,10 +120,10 @@ def matches_of(
 
 def outcomes(table: PairTables) -> dict[str, np.ndarray]:
     """Return the errors (2,) of one pair for all weights and refinements."""
-    measures, logits, (gicp, em) = table.tables
+    transforms, measures, logits, (gicp, em) = table.tables
 
     def chosen(weights: ChoiceWeights, count: int) -> int:
-        return choose(measures[:count], weights, logits.__getitem__)
+        return choose(Candidates(transforms[:count], measures[:count]), weights, logits.__getitem__)
 
     found = len(measures) - 1
     rows = {

@@ -700,9 +700,10 @@ def test_only_a_network_with_matchabilities_says_which_points_have_no_match(gene
 
 def test_the_candidate_of_the_largest_weighted_sum_is_chosen():
     measures = np.array([[0.5, 0.1, 0.1, 0.5], [0.6, 0.1, 0.5, 0.2], [0.5, 0.1, 0.1, 0.5]])
-    assert choice.choose(measures, (0.0, 0.0, 0.0, 0.0), None) == 1
-    assert choice.choose(measures, (0.0, -1.0, 0.0, 0.0), None) == 0  # the first of two equal ones
-    assert choice.choose(measures, (0.0, 0.0, 0.5, 0.0), None) == 0
+    for others, best in (((0, 0, 0), 1), ((0, -1, 0), 0), ((0, 0, 0.5), 0)):
+        weights = choice.ChoiceWeights(*others, 1.0)
+        candidates = choice.Candidates(np.empty((3, 4, 4)), measures)
+        assert choice.choose(candidates, weights, np.zeros_like) == best  # of equal ones, the first
 
 
 def test_the_verification_network_is_asked_for_the_best_candidates_alone(monkeypatch):
@@ -714,9 +715,12 @@ def test_the_verification_network_is_asked_for_the_best_candidates_alone(monkeyp
         asked.append(set(some.tolist()))
         return logits[some]
 
-    assert choice.choose(measures, (0.0, 0.0, 0.0, 1.0), verified) == 0
-    assert choice.choose(measures, (0.0, 0.0, 0.0, 0.01), verified) == 1
-    assert choice.choose(measures[:1], (0.0, 0.0, 0.0, 1.0), verified) == 0
+    heavy, light = choice.ChoiceWeights(0, 0, 0, 1.0), choice.ChoiceWeights(0, 0, 0, 0.01)
+    candidates = choice.Candidates(np.empty((3, 4, 4)), measures)
+    assert choice.choose(candidates, heavy, verified) == 0
+    assert choice.choose(candidates, light, verified) == 1
+    alone = choice.Candidates(np.empty((1, 4, 4)), measures[:1])
+    assert choice.choose(alone, heavy, verified) == 0
     assert asked == [{0, 1}] * 2  # one candidate needs no choice
 
 
@@ -728,6 +732,28 @@ def test_a_transform_that_is_nearly_an_earlier_one_is_dropped():
     transforms = np.stack([turned(0), turned(3), turned(90), turned(90, 0.2), turned(92, 0.2)])
     np.testing.assert_array_equal(choice.distinct(transforms), transforms[[0, 2, 3]])
     np.testing.assert_array_equal(choice.distinct(transforms[:1]), transforms[:1])
+
+
+def test_half_a_turn_of_the_best_candidate_is_a_candidate_too():
+    """Where the model offers a box the wrong way round, the right way is a candidate, too."""
+    box = np.random.default_rng(0).uniform(-1, 1, (600, 3))
+    box[np.arange(600), np.arange(600) % 3] = np.sign(box[:, 0])
+    box *= 1.2, 0.8, 0.5
+    truth = rigid.to_homogeneous(Rotation.from_rotvec([0.3, -0.5, 1.0]).as_matrix(), np.ones(3))
+    (x, y), scale, subsamples, scorer = preparation.prepare_clouds(
+        box, box @ truth[:3, :3].T + truth[:3, 3], 0
+    )
+    truth = preparation.from_original_units(truth, scale, x.centre, y.centre)
+    turns = choice.half_turned(truth, subsamples)
+    half = turns @ np.linalg.inv(truth)
+    np.testing.assert_allclose(half @ half, [np.eye(4)] * 3, atol=1e-9)
+    np.testing.assert_allclose(np.trace(half, axis1=1, axis2=2), 0, atol=1e-9)
+    for turn in turns:
+        mistaken = Hypotheses(turn[None], np.empty((0, 2), int), np.empty(0))
+        weights = choice.WITHOUT_MATCHABILITIES
+        found = choice.find_candidates(mistaken, weights, subsamples, scorer)
+        assert len(found.transforms) == len(found.measures) == 4
+        assert np.linalg.norm(found.transforms - truth, axis=(1, 2)).min() < 0.01
 
 
 def test_the_choice_is_by_agreement_coherence_unmatched_loss_and_support(pair):
@@ -743,6 +769,8 @@ def test_the_choice_is_by_agreement_coherence_unmatched_loss_and_support(pair):
     wrong, right = choice.measure(transforms, hypotheses, subsamples, scorer)
     better = np.sign([1.0, *choice.CHOICE_WEIGHTS[:-1]]) * (right - wrong)
     assert (better[[0, 2, 3]] > 0).all()
-    assert choice.choose(np.stack([wrong, right]), choice.CHOICE_WEIGHTS, None) == 1
+    candidates = choice.Candidates(transforms, np.stack([wrong, right]))
+    assert choice.choose(candidates, choice.CHOICE_WEIGHTS, np.zeros_like) == 1
     wrongly, rightly = verify(transforms, hypotheses, subsamples)
     assert rightly > wrongly
+    assert not verify(transforms, hypotheses._replace(verification=None), subsamples).any()

@@ -78,7 +78,7 @@ def test_evidence_tells_points_on_each_other_from_points_apart(registered):
 
 
 def test_the_truth_is_the_last_candidate_and_right(pairs, generate):
-    sets = candidate_set(pairs, generate, np.random.default_rng(0))
+    sets = candidate_set(pairs, generate)
     assert sets.right[-1]
     assert len(sets.right) == len(sets.evidence) == len(sets.nearest)
     assert not sets.right.all()
@@ -86,7 +86,7 @@ def test_the_truth_is_the_last_candidate_and_right(pairs, generate):
 
 
 def test_the_shipped_network_prefers_the_truth(pairs, generate):
-    sets = candidate_set(pairs, generate, np.random.default_rng(0))
+    sets = candidate_set(pairs, generate)
     assert generate.verification is not None
     logits = generate.verification(
         sets.features.float(), sets.evidence.float(), sets.nearest.long()

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from corrmat.ops import rigid
 from corrmat.registration.em_icp import WIDTHS, em_icp
 from corrmat.registration.hypotheses import Hypotheses
 from corrmat.registration.preparation import MODEL_POINTS
@@ -22,6 +23,7 @@ class ChoiceWeights(NamedTuple):
 
 CHOICE_WEIGHTS = ChoiceWeights(4.0, -1.0, 0.2, 0.035)  # benchmarks/choice.py
 WITHOUT_MATCHABILITIES = ChoiceWeights(1.5, 0.0, 0.0, 0.0)  # for models that have none
+HALF_TURNED = 3  # candidates at most
 VERIFIED = 8  # candidates at most
 CANDIDATE_STEPS = 5  # of generalised ICP, for each candidate; EM-ICP with matches does the rest
 STEPS_WITHOUT_MATCHES = 30  # the same for models that have none
@@ -39,18 +41,68 @@ def distinct(transforms: np.ndarray) -> np.ndarray:
     return kept
 
 
-def refine_candidates(hypotheses: Hypotheses, scorer: AlignmentScorer) -> np.ndarray:
-    """Refine the transforms of hypotheses a little by generalised ICP and drop copies.
+class Candidates(NamedTuple):
+    """Refined transforms to choose from."""
+
+    transforms: np.ndarray  # (T, 4, 4)
+    measures: np.ndarray  # (T, 4), see `measure`
+
+    def best(self, weights: ChoiceWeights, count: int) -> np.ndarray:
+        """Return the indices of the candidates of the highest sums of measures, best first."""
+        return np.argsort(-weigh(self.measures, weights), kind="stable")[:count]
+
+
+def find_candidates(
+    hypotheses: Hypotheses,
+    weights: ChoiceWeights,
+    subsamples: tuple[np.ndarray, np.ndarray],
+    scorer: AlignmentScorer,
+) -> Candidates:
+    """Refine hypotheses, drop copies, and add what the best of them may be mistaken for.
+
+    A thing that is nearly symmetric fits itself after half a turn. So the best candidates are
+    turned by 180 degrees about each principal axis as well.
 
     Args:
         hypotheses: of the model.
+        weights: of the measures.
+        subsamples: the clouds that they were made from.
         scorer: of the clouds.
+    """
+    refined = refine_some(hypotheses.transforms, hypotheses, scorer)
+    found = Candidates(refined, measure(refined, hypotheses, subsamples, scorer))
+    turned = np.concatenate(
+        [half_turned(refined[best], subsamples) for best in found.best(weights, HALF_TURNED)]
+    )
+    every = distinct(np.concatenate([refined, refine_some(turned, hypotheses, scorer)]))
+    added = measure(every[len(refined) :], hypotheses, subsamples, scorer)
+    return Candidates(every, np.concatenate([found.measures, added]))
+
+
+def refine_some(
+    transforms: np.ndarray, hypotheses: Hypotheses, scorer: AlignmentScorer
+) -> np.ndarray:
+    """Refine transforms (T, 4, 4) a little by generalised ICP and drop copies."""
+    steps = STEPS_WITHOUT_MATCHES if hypotheses.prob is None else CANDIDATE_STEPS
+    return distinct(np.stack([scorer.refine(each, steps) for each in transforms]))
+
+
+def half_turned(transform: np.ndarray, subsamples: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Turn what a transform (4, 4) moves by 180 degrees, about each principal axis of both clouds.
+
+    Args:
+        transform: of the source onto the target.
+        subsamples: (N, 3 or more) and (M, 3 or more).
 
     Returns:
-        (T, 4, 4).
+        (3, 4, 4).
     """
-    steps = STEPS_WITHOUT_MATCHES if hypotheses.prob is None else CANDIDATE_STEPS
-    return distinct(np.stack([scorer.refine(each, steps) for each in hypotheses.transforms]))
+    source, target = (cloud[:, :3] for cloud in subsamples)
+    points = np.concatenate([source @ transform[:3, :3].T + transform[:3, 3], target])
+    centre = points.mean(0)
+    axes = np.linalg.eigh(np.cov(points.T))[1].T
+    rotation = 2 * axes[:, :, None] * axes[:, None] - np.eye(3)
+    return rigid.to_homogeneous(rotation, centre - rotation @ centre) @ transform
 
 
 def measure(
@@ -75,28 +127,31 @@ def measure(
         agreement, coherence, distances = scorer.alignment(transform)
         support = hypotheses.support(transform, *subsamples)
         rows.append((agreement, coherence, hypotheses.unmatched_loss(distances), support))
-    return np.array(rows)
+    return np.array(rows).reshape(-1, 4)
 
 
 def choose(
-    measures: np.ndarray,
+    candidates: Candidates,
     weights: ChoiceWeights,
-    verified: Callable[[np.ndarray], np.ndarray] | None,
+    verified: Callable[[np.ndarray], np.ndarray],
 ) -> int:
-    """Choose the candidate of the highest score.
+    """Choose the candidate of the highest score; only the best by measures are verified.
 
     Args:
-        measures: (T, 4) of `measure`.
+        candidates: of one pair.
         weights: of coherence, unmatched loss, support and verification, beside agreement's 1.
-        verified: what `verify` says of the candidates at (n,) indices; None if nothing can.
+        verified: what `verify` says of the candidates at (n,) indices.
     """
-    *of_measures, of_verification = weights
-    scores = measures @ [1.0, *of_measures]
-    best = np.argsort(-scores, kind="stable")[:VERIFIED]
-    if verified is not None and len(best) > 1:
-        scores[best] += of_verification * verified(best)
-        return int(best[np.argmax(scores[best])])
-    return int(best[0])
+    best = candidates.best(weights, VERIFIED)
+    if len(best) == 1:
+        return int(best[0])
+    scores = weigh(candidates.measures[best], weights) + weights.verification * verified(best)
+    return int(best[np.argmax(scores)])
+
+
+def weigh(measures: np.ndarray, weights: ChoiceWeights) -> np.ndarray:
+    """Sum measures (T, 4) to scores (T,), without the verification."""
+    return measures @ [1.0, *weights[:3]]
 
 
 def refine_chosen(

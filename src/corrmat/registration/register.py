@@ -14,9 +14,10 @@ from corrmat.errors import CorrmatError
 from corrmat.registration.choice import (
     CHOICE_WEIGHTS,
     WITHOUT_MATCHABILITIES,
+    Candidates,
     choose,
+    find_candidates,
     measure,
-    refine_candidates,
     refine_chosen,
 )
 from corrmat.registration.hypotheses import CLASSICAL, HypothesisGenerator, NetworkHypotheses
@@ -83,16 +84,16 @@ def register(
     hypotheses = generate(*subsamples, seed)
     weights = WITHOUT_MATCHABILITIES if hypotheses.unmatched_nll is None else CHOICE_WEIGHTS
 
-    candidates = hypotheses.transforms
     if refine == "icp":
-        candidates = refine_candidates(hypotheses, scorer)
-    measures = measure(candidates, hypotheses, subsamples, scorer)
+        candidates = find_candidates(hypotheses, weights, subsamples, scorer)
+    else:
+        measures = measure(hypotheses.transforms, hypotheses, subsamples, scorer)
+        candidates = Candidates(hypotheses.transforms, measures)
 
     def verified(some: np.ndarray) -> np.ndarray:
-        return verify(candidates[some], hypotheses, subsamples)
+        return verify(candidates.transforms[some], hypotheses, subsamples)
 
-    verifiable = hypotheses.verification is not None
-    transform = candidates[choose(measures, weights, verified if verifiable else None)]
+    transform = candidates.transforms[choose(candidates, weights, verified)]
     full = scorer
     if max(len(x.rows), len(y.rows)) > SELECTION_POINTS:
         full = AlignmentScorer(x.points(scale, FULL_POINTS), y.points(scale, FULL_POINTS))

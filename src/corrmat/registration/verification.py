@@ -24,13 +24,14 @@ def verify(
 
     Args:
         transforms: (T, 4, 4).
-        hypotheses: of a network that has one.
+        hypotheses: of the model.
         subsamples: the clouds that they were made from.
 
     Returns:
-        (T,) logits; see `VerificationNetwork`.
+        (T,) logits, see `VerificationNetwork`; zeros if the model has no such network.
     """
-    assert hypotheses.verification is not None
+    if hypotheses.verification is None:
+        return np.zeros(len(transforms))
     return hypotheses.verification(*evidence(transforms, hypotheses, subsamples)).double().numpy()
 
 

@@ -1,9 +1,8 @@
 """Training of the verification network, on the candidates of the shipped weights.
 
 Every training pair has a new shape and is registered up to its candidates. The network learns which
-of a pair's candidates are right, by the cross-entropy over them; the true transform, refined like
-a candidate, is among them. A wrong candidate that is as good as the right one, for a symmetric
-thing, does not count.
+of the candidates that it would see are right, by the cross-entropy over them; the true transform,
+refined like a candidate, and half turns of it are among them.
 """
 
 import functools
@@ -28,9 +27,15 @@ from corrmat.data.datamodule import PairDataset, RegistrationDataModule
 from corrmat.networks.verification import VerificationNetwork
 from corrmat.ops import rigid
 from corrmat.registration import benchmark
-from corrmat.registration.choice import refine_candidates
+from corrmat.registration.choice import (
+    CHOICE_WEIGHTS,
+    VERIFIED,
+    find_candidates,
+    half_turned,
+    refine_some,
+)
 from corrmat.registration.hypotheses import NetworkHypotheses
-from corrmat.registration.preparation import from_original_units, prepare_clouds, to_original_units
+from corrmat.registration.preparation import from_original_units, prepare_clouds
 from corrmat.registration.shipping import recalibrate
 from corrmat.registration.verification import evidence
 from corrmat.revision import commit
@@ -40,8 +45,7 @@ SIZES = 512, 560, 640, 768, 1024  # points of a cloud before it is cropped
 PROTOCOLS: tuple[benchmark.Protocol, ...] = ("real", "views", "real", "views", "real", "clean")
 STRETCH = 1.4
 SHARD_PAIRS = 100
-WRONG = 8  # candidates of a pair that are kept at most, besides the truth
-RIGHT, AS_GOOD = 0.15, 0.05  # mean distance of a right transform's points, and ADD-S of one as good
+RIGHT = 0.15  # mean distance that a right transform's points have from their true place
 BATCH_PAIRS = 8
 RATE = 2e-3
 
@@ -58,7 +62,7 @@ class CandidateSet(NamedTuple):
 def train_verification(
     runs: Path = Path("runs"),
     data: str = "shapes+assemblies+rooms",
-    pairs: int = 9000,
+    pairs: int = 7000,
     steps: int = 5000,
     seed: int = 1,
     workers: int = 2,
@@ -128,34 +132,30 @@ def write_shard(path: Path, number: int, *, data: str, seed: int, count: int) ->
         settings = replace(benchmark.PROTOCOLS[protocol], num_points=size, stretch=STRETCH)
         dataset = PairDataset(clouds, settings, seed, "train", new_shapes=True)
         pair = dataset[number * SHARD_PAIRS + index, int(rng.integers(len(clouds)))]
-        sets.append(tuple(candidate_set(pair, generate, rng)))
+        sets.append(tuple(candidate_set(pair, generate)))
     path.parent.mkdir(parents=True, exist_ok=True)
     torch.save(sets, path.with_suffix(".part"))
     path.with_suffix(".part").rename(path)
 
 
-def candidate_set(
-    pairs: PairBatch, generate: NetworkHypotheses, rng: np.random.Generator
-) -> CandidateSet:
+def candidate_set(pairs: PairBatch, generate: NetworkHypotheses) -> CandidateSet:
     """Register a pair, a batch of one, up to its candidates, and label them."""
     source, target = (c[0].double().numpy() for c in (pairs.source, pairs.target))
     (x, y), scale, subsamples, scorer = prepare_clouds(source, target, 0)
     hypotheses = generate(*subsamples, 0)
     truth = rigid.to_homogeneous(pairs.rotation[0], pairs.translation[0])
     truth = from_original_units(truth, scale, x.centre, y.centre)
-    found = refine_candidates(hypotheses, scorer)
-    true = refine_candidates(hypotheses._replace(transforms=truth[None]), scorer)
-    transforms = np.concatenate([found[rng.permutation(len(found))[:WRONG]], true])
+    found = find_candidates(hypotheses, CHOICE_WEIGHTS, subsamples, scorer)
+    best = found.transforms[found.best(CHOICE_WEIGHTS, VERIFIED)]
+    true = refine_some(truth[None], hypotheses, scorer)
+    turned = refine_some(half_turned(true[0], subsamples), hypotheses, scorer)
+    transforms = np.concatenate([best, turned, true])
     points = subsamples[0][:, :3]
     offsets = points @ (transforms - truth)[:, :3, :3].transpose(0, 2, 1)
     offsets += (transforms - truth)[:, None, :3, 3]
     right = np.linalg.norm(offsets, axis=2).mean(1) < RIGHT
-    original = [to_original_units(each, scale, x.centre, y.centre) for each in transforms]
-    adds = np.array([benchmark.errors(pairs, 0, each)[1] for each in original])
-    counts = right | (adds > AS_GOOD)
-    features, seen, nearest = evidence(transforms[counts], hypotheses, subsamples)
-    labels = torch.from_numpy(right[counts])
-    return CandidateSet(features.half(), seen.half(), nearest.short(), labels)
+    features, seen, nearest = evidence(transforms, hypotheses, subsamples)
+    return CandidateSet(features.half(), seen.half(), nearest.short(), torch.from_numpy(right))
 
 
 class VerificationTraining(L.LightningModule):
