@@ -70,6 +70,7 @@ class PairTables(NamedTuple):
     """What a pair's candidates, and its truth, are worth."""
 
     candidates: int  # before copies are dropped
+    unturned: int  # candidates that are no half turns, the first of them
     tables: CandidateTables  # of the candidates that `register` chooses from
     refined_truth: np.ndarray  # (2, 2) errors of the truth after EM-ICP alone, as `PRIORS`
     right_matches: list[float]  # share of the matches, by weight, for each of `ANCHORS`
@@ -94,6 +95,7 @@ def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> Pair
     em = [refine_chosen(each, hypotheses, subsamples, scorer) for each in candidates]
     return PairTables(
         len(hypotheses.transforms),
+        len(refine_some(hypotheses.transforms, hypotheses, scorer)),
         CandidateTables(
             candidates,
             measure(candidates, hypotheses, subsamples, scorer),
@@ -129,7 +131,9 @@ def outcomes(table: PairTables) -> dict[str, np.ndarray]:
     rows = {
         ", ".join(f"{weight:g}" for weight in tried): em[chosen(tried, found)] for tried in TRIED
     }
+    rows["in use, without half turns"] = em[chosen(CHOICE_WEIGHTS, table.unturned)]
     rows["best candidate"] = em[:-1].min(0)
+    rows["best candidate, without half turns"] = em[: table.unturned].min(0)
     rows["in use, the truth among the candidates"] = em[chosen(CHOICE_WEIGHTS, found + 1)]
     rows["in use, generalised ICP alone"] = gicp[chosen(CHOICE_WEIGHTS, found)]
     rows["the truth, after generalised ICP"] = gicp[-1]

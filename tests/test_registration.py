@@ -37,7 +37,7 @@ from corrmat.registration.hypotheses import (
     unmatched_nll,
 )
 from corrmat.registration.scene import build_scene, extent
-from corrmat.registration.scoring import AlignmentScorer
+from corrmat.registration.scoring import COARSE_POINTS, AlignmentScorer
 from corrmat.registration.verification import verify
 from corrmat.registration.view import registration_page
 from corrmat.types import Prediction
@@ -732,6 +732,14 @@ def test_a_transform_that_is_nearly_an_earlier_one_is_dropped():
     transforms = np.stack([turned(0), turned(3), turned(90), turned(90, 0.2), turned(92, 0.2)])
     np.testing.assert_array_equal(choice.distinct(transforms), transforms[[0, 2, 3]])
     np.testing.assert_array_equal(choice.distinct(transforms[:1]), transforms[:1])
+
+
+def test_a_coarse_scorer_has_the_first_points():
+    cloud = np.random.default_rng(0).normal(size=(COARSE_POINTS + 1, 3))
+    scorer = AlignmentScorer(cloud, cloud[:20])
+    np.testing.assert_array_equal(scorer.coarse.source, cloud[:-1])
+    np.testing.assert_array_equal(scorer.coarse.target, cloud[:20])
+    assert scorer.coarse.coarse is scorer.coarse
 
 
 def test_half_a_turn_of_the_best_candidate_is_a_candidate_too():

@@ -9,7 +9,7 @@ from corrmat.ops import rigid
 from corrmat.registration.em_icp import WIDTHS, em_icp
 from corrmat.registration.hypotheses import Hypotheses
 from corrmat.registration.preparation import MODEL_POINTS
-from corrmat.registration.scoring import AlignmentScorer
+from corrmat.registration.scoring import COARSE_POINTS, AlignmentScorer
 
 
 class ChoiceWeights(NamedTuple):
@@ -26,9 +26,7 @@ WITHOUT_MATCHABILITIES = ChoiceWeights(1.5, 0.0, 0.0, 0.0)  # for models that ha
 HALF_TURNED = 3  # candidates at most
 VERIFIED = 8  # candidates at most
 CANDIDATE_STEPS = 5  # of generalised ICP, for each candidate; EM-ICP with matches does the rest
-STEPS_WITHOUT_MATCHES = 30  # the same for models that have none
 SAME_TRANSFORM = 0.1  # difference of two matrices: a turn by 4 degrees, or a shift by 0.1
-COARSE_POINTS = 400  # of each cloud, for EM-ICP's first pass
 FINE_ITERATIONS = 4  # of its second pass, on all points of a model with matches
 
 
@@ -82,9 +80,10 @@ def find_candidates(
 def refine_some(
     transforms: np.ndarray, hypotheses: Hypotheses, scorer: AlignmentScorer
 ) -> np.ndarray:
-    """Refine transforms (T, 4, 4) a little by generalised ICP and drop copies."""
-    steps = STEPS_WITHOUT_MATCHES if hypotheses.prob is None else CANDIDATE_STEPS
-    return distinct(np.stack([scorer.refine(each, steps) for each in transforms]))
+    """Refine transforms (T, 4, 4) by generalised ICP, a little with matches, and drop copies."""
+    if hypotheses.prob is None:
+        return distinct(np.stack([scorer.refine(each) for each in transforms]))
+    return distinct(np.stack([scorer.coarse.refine(each, CANDIDATE_STEPS) for each in transforms]))
 
 
 def half_turned(transform: np.ndarray, subsamples: tuple[np.ndarray, np.ndarray]) -> np.ndarray:

@@ -10,6 +10,7 @@ from scipy.spatial import KDTree
 from corrmat.data.normals import NEIGHBORS
 from corrmat.types import MATCH_DISTANCE
 
+COARSE_POINTS = 400  # of each cloud, to refine many transforms a little
 _TOO_SMALL = 10  # points, for small_gicp
 _SAME = 0.02  # of `max_distance`: points that lie nearer than this are one point
 _SHARED = 0.1  # share of the source's points that are the target's, too
@@ -61,6 +62,13 @@ class AlignmentScorer:
         """Unit normals of source (N, 3) and target (M, 3), of any sign."""
         source, target, _ = self._clouds
         return np.asarray(source.normals())[:, :3], np.asarray(target.normals())[:, :3]
+
+    @functools.cached_property
+    def coarse(self) -> "AlignmentScorer":
+        """Scorer of the first `COARSE_POINTS` of each cloud."""
+        if max(len(self.source), len(self.target)) <= COARSE_POINTS:
+            return self
+        return AlignmentScorer(self.source[:COARSE_POINTS], self.target[:COARSE_POINTS])
 
     def refine(self, transform: np.ndarray, iterations: int = 30) -> np.ndarray:
         """Refine a transform (4, 4) by generalised ICP (Segal et al., RSS 2009).
