@@ -21,7 +21,7 @@ class ChoiceWeights(NamedTuple):
     verification: float  # the logit of the verification network, for the best of the others' sum
 
 
-CHOICE_WEIGHTS = ChoiceWeights(4.0, -1.0, 0.2, 0.035)  # benchmarks/choice.py
+CHOICE_WEIGHTS = ChoiceWeights(4.0, -1.0, 0.2, 0.05)  # benchmarks/choice.py
 WITHOUT_MATCHABILITIES = ChoiceWeights(1.5, 0.0, 0.0, 0.0)  # for models that have none
 HALF_TURNED = 3  # candidates at most
 VERIFIED = 8  # candidates at most

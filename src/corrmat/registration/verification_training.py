@@ -63,7 +63,7 @@ def train_verification(
     runs: Path = Path("runs"),
     data: str = "shapes+assemblies+rooms",
     pairs: int = 7000,
-    steps: int = 5000,
+    steps: int = 3500,
     seed: int = 1,
     workers: int = 2,
 ) -> None:
