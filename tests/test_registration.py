@@ -757,11 +757,13 @@ def test_half_a_turn_of_the_best_candidate_is_a_candidate_too():
     np.testing.assert_allclose(half @ half, [np.eye(4)] * 3, atol=1e-9)
     np.testing.assert_allclose(np.trace(half, axis1=1, axis2=2), 0, atol=1e-9)
     for turn in turns:
-        mistaken = Hypotheses(turn[None], np.empty((0, 2), int), np.empty(0))
+        mistaken = Hypotheses(np.stack([turn] * 2), np.empty((0, 2), int), np.empty(0))
         weights = choice.WITHOUT_MATCHABILITIES
         found = choice.find_candidates(mistaken, weights, subsamples, scorer)
         assert len(found.transforms) == len(found.measures) == 4
         assert np.linalg.norm(found.transforms - truth, axis=(1, 2)).min() < 0.01
+        only = mistaken._replace(transforms=turn[None])  # as of ICP, which stays where it is
+        assert len(choice.find_candidates(only, weights, subsamples, scorer).transforms) == 1
 
 
 def test_the_choice_is_by_agreement_coherence_unmatched_loss_and_support(pair):

@@ -59,7 +59,8 @@ def find_candidates(
     """Refine hypotheses, drop copies, and add what the best of them may be mistaken for.
 
     A thing that is nearly symmetric fits itself after half a turn. So the best candidates are
-    turned by 180 degrees about each principal axis as well.
+    turned by 180 degrees about each principal axis as well. A model of one hypothesis has no doubt,
+    and the user of ICP wants the nearest pose: these keep it.
 
     Args:
         hypotheses: of the model.
@@ -69,6 +70,8 @@ def find_candidates(
     """
     refined = refine_some(hypotheses.transforms, hypotheses, scorer)
     found = Candidates(refined, measure(refined, hypotheses, subsamples, scorer))
+    if len(hypotheses.transforms) == 1:
+        return found
     turned = np.concatenate(
         [half_turned(refined[best], subsamples) for best in found.best(weights, HALF_TURNED)]
     )
@@ -126,7 +129,7 @@ def measure(
         agreement, coherence, distances = scorer.alignment(transform)
         support = hypotheses.support(transform, *subsamples)
         rows.append((agreement, coherence, hypotheses.unmatched_loss(distances), support))
-    return np.array(rows).reshape(-1, 4)
+    return np.reshape(rows, (-1, 4))
 
 
 def choose(
