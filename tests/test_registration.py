@@ -24,6 +24,7 @@ from corrmat.data.scans import read_scan, write_ply
 from corrmat.data.shapes.dataset import make_shape
 from corrmat.errors import CorrmatError
 from corrmat.methods import InvariantCorr
+from corrmat.networks.verification import VerificationNetwork
 from corrmat.ops import rigid
 from corrmat.ops.correspondence import MatchabilityCorrespondence, SoftCorrespondence
 from corrmat.options import REGISTER_EPILOG
@@ -757,13 +758,14 @@ def test_half_a_turn_of_the_best_candidate_is_a_candidate_too():
     np.testing.assert_allclose(half @ half, [np.eye(4)] * 3, atol=1e-9)
     np.testing.assert_allclose(np.trace(half, axis1=1, axis2=2), 0, atol=1e-9)
     for turn in turns:
-        mistaken = Hypotheses(np.stack([turn] * 2), np.empty((0, 2), int), np.empty(0))
+        mistaken = Hypotheses(turn[None], np.empty((0, 2), int), np.empty(0))
+        mistaken = mistaken._replace(verification=VerificationNetwork())
         weights = choice.WITHOUT_MATCHABILITIES
         found = choice.find_candidates(mistaken, weights, subsamples, scorer)
         assert len(found.transforms) == len(found.measures) == 4
         assert np.linalg.norm(found.transforms - truth, axis=(1, 2)).min() < 0.01
-        only = mistaken._replace(transforms=turn[None])  # as of ICP, which stays where it is
-        assert len(choice.find_candidates(only, weights, subsamples, scorer).transforms) == 1
+        alone = mistaken._replace(verification=None)  # as of ICP, which stays where it is
+        assert len(choice.find_candidates(alone, weights, subsamples, scorer).transforms) == 1
 
 
 def test_the_choice_is_by_agreement_coherence_unmatched_loss_and_support(pair):

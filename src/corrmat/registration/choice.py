@@ -59,8 +59,8 @@ def find_candidates(
     """Refine hypotheses, drop copies, and add what the best of them may be mistaken for.
 
     A thing that is nearly symmetric fits itself after half a turn. So the best candidates are
-    turned by 180 degrees about each principal axis as well. A model of one hypothesis has no doubt,
-    and the user of ICP wants the nearest pose: these keep it.
+    turned by 180 degrees about each principal axis as well, if a verification network can tell the
+    turned ones from the right one; the measures alone cannot.
 
     Args:
         hypotheses: of the model.
@@ -70,7 +70,7 @@ def find_candidates(
     """
     refined = refine_some(hypotheses.transforms, hypotheses, scorer)
     found = Candidates(refined, measure(refined, hypotheses, subsamples, scorer))
-    if len(hypotheses.transforms) == 1:
+    if hypotheses.verification is None:
         return found
     turned = np.concatenate(
         [half_turned(refined[best], subsamples) for best in found.best(weights, HALF_TURNED)]
