@@ -27,7 +27,7 @@ HALF_TURNED = 3  # candidates at most
 VERIFIED = 8  # candidates at most
 CANDIDATE_STEPS = 5  # of generalised ICP, for each candidate; EM-ICP with matches does the rest
 SAME_TRANSFORM = 0.1  # difference of two matrices: a turn by 4 degrees, or a shift by 0.1
-FINE_ITERATIONS = 4  # of its second pass, on all points of a model with matches
+FINE_ITERATIONS = 4  # of EM-ICP's second pass, on all points of a model with matches
 
 
 def distinct(transforms: np.ndarray) -> np.ndarray:
