@@ -25,7 +25,6 @@ from corrmat.ops import rigid
 from corrmat.registration import benchmark
 from corrmat.registration.choice import (
     CHOICE_WEIGHTS,
-    Candidates,
     ChoiceWeights,
     choose,
     find_candidates,
@@ -60,7 +59,6 @@ _SEED = 5  # of pairs that nothing else uses
 class CandidateTables(NamedTuple):
     """What candidates are worth; the last of them is the true transform."""
 
-    transforms: np.ndarray  # (T + 1, 4, 4)
     measures: np.ndarray  # (T + 1, 4) agreement, coherence, unmatched loss, support
     logits: np.ndarray  # (T + 1,) of the verification network
     errors: np.ndarray  # (2, T + 1, 2) degrees and ADD-S, after generalised ICP and after EM-ICP
@@ -88,17 +86,16 @@ def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> Pair
         in_units = [to_original_units(t, scale, x.centre, y.centre) for t in transforms]
         return np.array([benchmark.errors(pairs, index, t) for t in in_units])
 
-    found = find_candidates(hypotheses, CHOICE_WEIGHTS, subsamples, scorer)
+    found, measures = find_candidates(hypotheses, subsamples, scorer)
     true = refine_some(truth[None], hypotheses, scorer)
-    candidates = np.concatenate([found.transforms, true])
+    candidates = np.concatenate([found, true])
     gicp = [scorer.refine(each) for each in candidates]
     em = [refine_chosen(each, hypotheses, subsamples, scorer) for each in candidates]
     return PairTables(
         len(hypotheses.transforms),
         len(refine_some(hypotheses.transforms, hypotheses, scorer)),
         CandidateTables(
-            candidates,
-            measure(candidates, hypotheses, subsamples, scorer),
+            np.concatenate([measures, measure(true, hypotheses, subsamples, scorer)]),
             verify(candidates, hypotheses, subsamples),
             np.stack([errors_of(each) for each in (gicp, em)]),
         ),
@@ -122,10 +119,10 @@ def matches_of(
 
 def outcomes(table: PairTables) -> dict[str, np.ndarray]:
     """Return the errors (2,) of one pair for all weights and refinements."""
-    transforms, measures, logits, (gicp, em) = table.tables
+    measures, logits, (gicp, em) = table.tables
 
     def chosen(weights: ChoiceWeights, count: int) -> int:
-        return choose(Candidates(transforms[:count], measures[:count]), weights, logits.__getitem__)
+        return choose(measures[:count], weights, logits.__getitem__)
 
     found = len(measures) - 1
     rows = {

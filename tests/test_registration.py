@@ -703,8 +703,7 @@ def test_the_candidate_of_the_largest_weighted_sum_is_chosen():
     measures = np.array([[0.5, 0.1, 0.1, 0.5], [0.6, 0.1, 0.5, 0.2], [0.5, 0.1, 0.1, 0.5]])
     for others, best in (((0, 0, 0), 1), ((0, -1, 0), 0), ((0, 0, 0.5), 0)):
         weights = choice.ChoiceWeights(*others, 1.0)
-        candidates = choice.Candidates(np.empty((3, 4, 4)), measures)
-        assert choice.choose(candidates, weights, np.zeros_like) == best  # of equal ones, the first
+        assert choice.choose(measures, weights, np.zeros_like) == best  # of equal ones, the first
 
 
 def test_the_verification_network_is_asked_for_the_best_candidates_alone(monkeypatch):
@@ -717,11 +716,9 @@ def test_the_verification_network_is_asked_for_the_best_candidates_alone(monkeyp
         return logits[some]
 
     heavy, light = choice.ChoiceWeights(0, 0, 0, 1.0), choice.ChoiceWeights(0, 0, 0, 0.01)
-    candidates = choice.Candidates(np.empty((3, 4, 4)), measures)
-    assert choice.choose(candidates, heavy, verified) == 0
-    assert choice.choose(candidates, light, verified) == 1
-    alone = choice.Candidates(np.empty((1, 4, 4)), measures[:1])
-    assert choice.choose(alone, heavy, verified) == 0
+    assert choice.choose(measures, heavy, verified) == 0
+    assert choice.choose(measures, light, verified) == 1
+    assert choice.choose(measures[:1], heavy, verified) == 0
     assert asked == [{0, 1}] * 2  # one candidate needs no choice
 
 
@@ -760,12 +757,11 @@ def test_half_a_turn_of_the_best_candidate_is_a_candidate_too():
     for turn in turns:
         mistaken = Hypotheses(turn[None], np.empty((0, 2), int), np.empty(0))
         mistaken = mistaken._replace(verification=VerificationNetwork())
-        weights = choice.WITHOUT_MATCHABILITIES
-        found = choice.find_candidates(mistaken, weights, subsamples, scorer)
-        assert len(found.transforms) == len(found.measures) == 4
-        assert np.linalg.norm(found.transforms - truth, axis=(1, 2)).min() < 0.01
+        found, measures = choice.find_candidates(mistaken, subsamples, scorer)
+        assert len(found) == len(measures) == 4
+        assert np.linalg.norm(found - truth, axis=(1, 2)).min() < 0.01
         alone = mistaken._replace(verification=None)  # as of ICP, which stays where it is
-        assert len(choice.find_candidates(alone, weights, subsamples, scorer).transforms) == 1
+        assert len(choice.find_candidates(alone, subsamples, scorer)[0]) == 1
 
 
 def test_the_choice_is_by_agreement_coherence_unmatched_loss_and_support(pair):
@@ -781,8 +777,8 @@ def test_the_choice_is_by_agreement_coherence_unmatched_loss_and_support(pair):
     wrong, right = choice.measure(transforms, hypotheses, subsamples, scorer)
     better = np.sign([1.0, *choice.CHOICE_WEIGHTS[:-1]]) * (right - wrong)
     assert (better[[0, 2, 3]] > 0).all()
-    candidates = choice.Candidates(transforms, np.stack([wrong, right]))
-    assert choice.choose(candidates, choice.CHOICE_WEIGHTS, np.zeros_like) == 1
+    measures = np.stack([wrong, right])
+    assert choice.choose(measures, choice.CHOICE_WEIGHTS, np.zeros_like) == 1
     wrongly, rightly = verify(transforms, hypotheses, subsamples)
     assert rightly > wrongly
     assert not verify(transforms, hypotheses._replace(verification=None), subsamples).any()

@@ -39,24 +39,12 @@ def distinct(transforms: np.ndarray) -> np.ndarray:
     return kept
 
 
-class Candidates(NamedTuple):
-    """Refined transforms to choose from."""
-
-    transforms: np.ndarray  # (T, 4, 4)
-    measures: np.ndarray  # (T, 4), see `measure`
-
-    def best(self, weights: ChoiceWeights, count: int) -> np.ndarray:
-        """Return the indices of the candidates of the highest sums of measures, best first."""
-        return np.argsort(-weigh(self.measures, weights), kind="stable")[:count]
-
-
 def find_candidates(
     hypotheses: Hypotheses,
-    weights: ChoiceWeights,
     subsamples: tuple[np.ndarray, np.ndarray],
     scorer: AlignmentScorer,
-) -> Candidates:
-    """Refine hypotheses, drop copies, and add what the best of them may be mistaken for.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Refine and measure hypotheses, drop copies, and add what the best may be mistaken for.
 
     A thing that is nearly symmetric fits itself after half a turn. So the best candidates are
     turned by 180 degrees about each principal axis as well, if a verification network can tell the
@@ -64,20 +52,21 @@ def find_candidates(
 
     Args:
         hypotheses: of the model.
-        weights: of the measures.
         subsamples: the clouds that they were made from.
         scorer: of the clouds.
+
+    Returns:
+        Transforms (T, 4, 4), half turns last, and their measures (T, 4).
     """
     refined = refine_some(hypotheses.transforms, hypotheses, scorer)
-    found = Candidates(refined, measure(refined, hypotheses, subsamples, scorer))
+    measures = measure(refined, hypotheses, subsamples, scorer)
     if hypotheses.verification is None:
-        return found
-    turned = np.concatenate(
-        [half_turned(refined[best], subsamples) for best in found.best(weights, HALF_TURNED)]
-    )
+        return refined, measures
+    best = refined[best_by_measures(measures, CHOICE_WEIGHTS, HALF_TURNED)]
+    turned = np.concatenate([half_turned(each, subsamples) for each in best])
     every = distinct(np.concatenate([refined, refine_some(turned, hypotheses, scorer)]))
     added = measure(every[len(refined) :], hypotheses, subsamples, scorer)
-    return Candidates(every, np.concatenate([found.measures, added]))
+    return every, np.concatenate([measures, added])
 
 
 def refine_some(
@@ -133,22 +122,27 @@ def measure(
 
 
 def choose(
-    candidates: Candidates,
+    measures: np.ndarray,
     weights: ChoiceWeights,
     verified: Callable[[np.ndarray], np.ndarray],
 ) -> int:
     """Choose the candidate of the highest score; only the best by measures are verified.
 
     Args:
-        candidates: of one pair.
+        measures: (T, 4) of `measure`.
         weights: of coherence, unmatched loss, support and verification, beside agreement's 1.
         verified: what `verify` says of the candidates at (n,) indices.
     """
-    best = candidates.best(weights, VERIFIED)
+    best = best_by_measures(measures, weights, VERIFIED)
     if len(best) == 1:
         return int(best[0])
-    scores = weigh(candidates.measures[best], weights) + weights.verification * verified(best)
+    scores = weigh(measures[best], weights) + weights.verification * verified(best)
     return int(best[np.argmax(scores)])
+
+
+def best_by_measures(measures: np.ndarray, weights: ChoiceWeights, count: int) -> np.ndarray:
+    """Return the indices of the candidates of the highest sums of measures (T, 4), best first."""
+    return np.argsort(-weigh(measures, weights), kind="stable")[:count]
 
 
 def weigh(measures: np.ndarray, weights: ChoiceWeights) -> np.ndarray:

@@ -14,7 +14,6 @@ from corrmat.errors import CorrmatError
 from corrmat.registration.choice import (
     CHOICE_WEIGHTS,
     WITHOUT_MATCHABILITIES,
-    Candidates,
     choose,
     find_candidates,
     measure,
@@ -85,15 +84,15 @@ def register(
     weights = WITHOUT_MATCHABILITIES if hypotheses.unmatched_nll is None else CHOICE_WEIGHTS
 
     if refine == "icp":
-        candidates = find_candidates(hypotheses, weights, subsamples, scorer)
+        candidates, measures = find_candidates(hypotheses, subsamples, scorer)
     else:
-        measures = measure(hypotheses.transforms, hypotheses, subsamples, scorer)
-        candidates = Candidates(hypotheses.transforms, measures)
+        candidates = hypotheses.transforms
+        measures = measure(candidates, hypotheses, subsamples, scorer)
 
     def verified(some: np.ndarray) -> np.ndarray:
-        return verify(candidates.transforms[some], hypotheses, subsamples)
+        return verify(candidates[some], hypotheses, subsamples)
 
-    transform = candidates.transforms[choose(candidates, weights, verified)]
+    transform = candidates[choose(measures, weights, verified)]
     full = scorer
     if max(len(x.rows), len(y.rows)) > SELECTION_POINTS:
         full = AlignmentScorer(x.points(scale, FULL_POINTS), y.points(scale, FULL_POINTS))

@@ -30,6 +30,7 @@ from corrmat.registration import benchmark
 from corrmat.registration.choice import (
     CHOICE_WEIGHTS,
     VERIFIED,
+    best_by_measures,
     find_candidates,
     half_turned,
     refine_some,
@@ -145,8 +146,8 @@ def candidate_set(pairs: PairBatch, generate: NetworkHypotheses) -> CandidateSet
     hypotheses = generate(*subsamples, 0)
     truth = rigid.to_homogeneous(pairs.rotation[0], pairs.translation[0])
     truth = from_original_units(truth, scale, x.centre, y.centre)
-    found = find_candidates(hypotheses, CHOICE_WEIGHTS, subsamples, scorer)
-    best = found.transforms[found.best(CHOICE_WEIGHTS, VERIFIED)]
+    found, measures = find_candidates(hypotheses, subsamples, scorer)
+    best = found[best_by_measures(measures, CHOICE_WEIGHTS, VERIFIED)]
     true = refine_some(truth[None], hypotheses, scorer)
     turned = refine_some(half_turned(true[0], subsamples), hypotheses, scorer)
     transforms = np.concatenate([best, turned, true])
