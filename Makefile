@@ -42,7 +42,7 @@ rates: .venv/ready  ## three learning rates for every arm, a twentieth of SCALE'
 weights: .venv/ready  ## train what `corrmat register` ships on the embedded shapes, put it into the package
 	$(BIN)/python reproduce/weights.py --scale $(SCALE) $(ARGS)
 
-verification: .venv/ready  ## train the network that chooses among candidates, for the weights that ship; an hour
+verification: .venv/ready  ## train the network that chooses among candidates, for the weights that ship; two hours
 	$(BIN)/python reproduce/verification.py $(ARGS)
 
 calibration: .venv/ready  ## fit the confidence of the shipped weights anew (after a change of the choice, not of the weights)

@@ -77,7 +77,7 @@ class PairTables(NamedTuple):
 def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> PairTables:
     """Refine and measure the candidates of a pair, and the true transform in the same way."""
     source, target = (c[index].double().numpy() for c in (pairs.source, pairs.target))
-    (x, y), scale, subsamples, scorer = prepare_clouds(source, target, 0)
+    (x, y), scale, subsamples, (scorer,) = prepare_clouds(source, target, 0)
     hypotheses = generate(*subsamples, 0)
     truth = rigid.to_homogeneous(pairs.rotation[index], pairs.translation[index])
     truth = from_original_units(truth, scale, x.centre, y.centre)
@@ -90,7 +90,7 @@ def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> Pair
     true = refine_some(truth[None], hypotheses, scorer)
     candidates = np.concatenate([found, true])
     gicp = [scorer.refine(each) for each in candidates]
-    em = [refine_chosen(each, hypotheses, subsamples, scorer) for each in candidates]
+    em = [refine_chosen(each, hypotheses, subsamples, [scorer]) for each in candidates]
     return PairTables(
         len(hypotheses.transforms),
         len(refine_some(hypotheses.transforms, hypotheses, scorer)),

@@ -20,6 +20,7 @@ from corrmat.baselines import fpfh_ransac
 from corrmat.calibration import SURE, verdict
 from corrmat.cli import main
 from corrmat.data.normals import estimate_normals
+from corrmat.data.room_pairs import make_room_pair
 from corrmat.data.scans import read_scan, write_ply
 from corrmat.data.shapes.dataset import make_shape
 from corrmat.errors import CorrmatError
@@ -746,7 +747,7 @@ def test_half_a_turn_of_the_best_candidate_is_a_candidate_too():
     box[np.arange(600), np.arange(600) % 3] = np.sign(box[:, 0])
     box *= 1.2, 0.8, 0.5
     truth = rigid.to_homogeneous(Rotation.from_rotvec([0.3, -0.5, 1.0]).as_matrix(), np.ones(3))
-    (x, y), scale, subsamples, scorer = preparation.prepare_clouds(
+    (x, y), scale, subsamples, (scorer,) = preparation.prepare_clouds(
         box, box @ truth[:3, :3].T + truth[:3, 3], 0
     )
     truth = preparation.from_original_units(truth, scale, x.centre, y.centre)
@@ -764,10 +765,24 @@ def test_half_a_turn_of_the_best_candidate_is_a_candidate_too():
         assert len(choice.find_candidates(alone, subsamples, scorer)[0]) == 1
 
 
+def test_a_fragment_of_a_room_that_lies_right_stays_there():
+    """EM-ICP alone slides it along its walls, by 14 cm."""
+    room = make_room_pair(12, 20_000, "val")
+    (x, y), scale, subsamples, scorers = preparation.prepare_clouds(room.source, room.target, 0)
+    assert [len(scorer.source) for scorer in scorers] == [*preparation.LEVELS]
+    hypotheses = NetworkHypotheses(load_model())(*subsamples, 0)
+    truth = rigid.to_homogeneous(room.rotation, room.translation)
+    right = preparation.from_original_units(truth, scale, x.centre, y.centre)
+    refined = choice.refine_chosen(right, hypotheses, subsamples, scorers)
+    refined = preparation.to_original_units(refined, scale, x.centre, y.centre)
+    moved = room.source @ (refined - truth)[:3, :3].T + (refined - truth)[:3, 3]
+    assert np.linalg.norm(moved, axis=1).mean() < 0.01  # metres
+
+
 def test_the_choice_is_by_agreement_coherence_unmatched_loss_and_support(pair):
     """Of the truth and a half turn, put first, the truth wins, and by each measure's own weight."""
     _, source, target, truth = pair
-    (x, y), scale, subsamples, scorer = preparation.prepare_clouds(source, target, 0)
+    (x, y), scale, subsamples, (scorer,) = preparation.prepare_clouds(source, target, 0)
     hypotheses = NetworkHypotheses(load_model())(*subsamples, 0)
     prepared = preparation.from_original_units(truth, scale, x.centre, y.centre)
     back = preparation.to_original_units(prepared, scale, x.centre, y.centre)

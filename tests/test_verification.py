@@ -31,7 +31,7 @@ def pairs():
 @pytest.fixture(scope="module")
 def registered(generate, pairs):
     source, target = (c[0].double().numpy() for c in (pairs.source, pairs.target))
-    _, _, subsamples, scorer = prepare_clouds(source, target, 0)
+    _, _, subsamples, (scorer,) = prepare_clouds(source, target, 0)
     return generate(*subsamples, 0), subsamples, scorer
 
 

@@ -1,6 +1,6 @@
 """The choice among a model's candidates, and the refinement of the chosen one."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -9,7 +9,11 @@ from corrmat.ops import rigid
 from corrmat.registration.em_icp import WIDTHS, em_icp
 from corrmat.registration.hypotheses import Hypotheses
 from corrmat.registration.preparation import MODEL_POINTS
-from corrmat.registration.scoring import COARSE_POINTS, AlignmentScorer
+from corrmat.registration.scoring import (
+    COARSE_POINTS,
+    AlignmentScorer,
+    refine_coarse_to_fine,
+)
 
 
 class ChoiceWeights(NamedTuple):
@@ -154,19 +158,22 @@ def refine_chosen(
     transform: np.ndarray,
     hypotheses: Hypotheses,
     subsamples: tuple[np.ndarray, np.ndarray],
-    full: AlignmentScorer,
+    scorers: Sequence[AlignmentScorer],
 ) -> np.ndarray:
     """Refine the chosen transform (4, 4) by EM-ICP, on a few points and then on all of the model's.
 
     With matches, the last iterations are enough for the second pass. Generalised ICP follows where
     it is more exact: on points that the model has not seen, and on points that both clouds share.
+    In large clouds the model's points are too few: EM-ICP slides along the walls of a room. There
+    generalised ICP starts from the chosen transform, too, and what agrees better is taken.
 
     Args:
         transform: of the source onto the target.
         hypotheses: from which it was chosen.
         subsamples: the clouds that they were made from.
-        full: scorer of the clouds, with all their points.
+        scorers: of the clouds, of more and more of their points.
     """
+    chosen = transform
     source, target = (cloud[:COARSE_POINTS] for cloud in subsamples)
     prob = hypotheses.prob
     some = None if prob is None else prob[: len(source), : len(target)]
@@ -174,5 +181,9 @@ def refine_chosen(
     if max(map(len, subsamples)) > COARSE_POINTS:
         widths = WIDTHS if prob is None else WIDTHS[-FINE_ITERATIONS:]
         transform = em_icp(transform, *subsamples, prob, widths)
+    full = scorers[-1]
+    if len(scorers) > 1:
+        refined = [refine_coarse_to_fine(each, scorers) for each in (chosen, transform)]
+        return max(refined, key=lambda each: full.alignment(each).agreement)
     more = max(len(full.source), len(full.target)) > MODEL_POINTS
     return full.refine(transform) if more or full.shares_points(transform) else transform

@@ -20,20 +20,14 @@ from corrmat.registration.choice import (
     refine_chosen,
 )
 from corrmat.registration.hypotheses import CLASSICAL, HypothesisGenerator, NetworkHypotheses
-from corrmat.registration.preparation import (
-    FULL_POINTS,
-    SELECTION_POINTS,
-    prepare_clouds,
-    to_original_units,
-)
+from corrmat.registration.preparation import prepare_clouds, to_original_units
 from corrmat.registration.result import Registration
-from corrmat.registration.scoring import AlignmentScorer
 from corrmat.registration.verification import verify
 from corrmat.weights import load_model
 
 Refine = Literal["icp", "none"]
-# Unrelated clouds of fewer points may lie on each other: they are "doubtful" at best.
-FEW_POINTS, FEW_CONFIDENCE = 30, 0.49
+FEW_POINTS = 30  # unrelated clouds of fewer points may lie on each other
+DOUBTFUL = 0.49  # confidence, at most, of so few points, and where no match agrees
 OTHER_SIZE = 8.0  # times as large: two such clouds may have different units
 
 
@@ -79,7 +73,8 @@ def register(
     else:
         generate = CLASSICAL.get(str(model)) or _load_network(str(model))
     start = time.perf_counter()
-    (x, y), scale, subsamples, scorer = prepare_clouds(source, target, seed)
+    (x, y), scale, subsamples, scorers = prepare_clouds(source, target, seed)
+    scorer, full = scorers[0], scorers[-1]
     hypotheses = generate(*subsamples, seed)
     weights = WITHOUT_MATCHABILITIES if hypotheses.unmatched_nll is None else CHOICE_WEIGHTS
 
@@ -93,18 +88,15 @@ def register(
         return verify(candidates[some], hypotheses, subsamples)
 
     transform = candidates[choose(measures, weights, verified)]
-    full = scorer
-    if max(len(x.rows), len(y.rows)) > SELECTION_POINTS:
-        full = AlignmentScorer(x.points(scale, FULL_POINTS), y.points(scale, FULL_POINTS))
     if refine == "icp":
-        transform = refine_chosen(transform, hypotheses, subsamples, full)
+        transform = refine_chosen(transform, hypotheses, subsamples, scorers)
     agreement = scorer.alignment(transform).agreement
     support = hypotheses.support(transform, *subsamples)
     agrees = hypotheses.match_support(transform, *subsamples) > 0
     confidence = _calibration().confidence(agreement, support if len(agrees) else None)
     fewest = min(len(x.rows), len(y.rows))
-    if fewest < FEW_POINTS:
-        confidence = min(confidence, FEW_CONFIDENCE)
+    if fewest < FEW_POINTS or (len(agrees) and not agrees.any()):
+        confidence = min(confidence, DOUBTFUL)
     overlap, rmse = full.overlap_and_rmse(transform)
     rows = [cloud.rows[m] for cloud, m in zip((x, y), hypotheses.matches.T, strict=True)]
     return Registration(

@@ -1,6 +1,7 @@
 """Refinement and scoring of a transform by how well it aligns two clouds."""
 
 import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -147,3 +148,13 @@ class AlignmentScorer:
         farthest = max(self.max_distance, MATCH_DISTANCE)
         distance, index = tree.query(points, distance_upper_bound=farthest)
         return np.asarray(distance), np.minimum(index, tree.n - 1)
+
+
+def refine_coarse_to_fine(transform: np.ndarray, scorers: Sequence[AlignmentScorer]) -> np.ndarray:
+    """Refine a transform (4, 4) by generalised ICP on more and more points.
+
+    Few points lie far apart, and draw a transform from far; many are exact.
+    """
+    for scorer in scorers:
+        transform = scorer.refine(transform)
+    return transform

@@ -7,7 +7,6 @@ refined like a candidate, and half turns of it are among them.
 
 import functools
 import multiprocessing
-import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
@@ -17,7 +16,7 @@ from typing import NamedTuple
 import lightning as L
 import numpy as np
 import torch
-from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
 from rich.progress import track
 from torch import Tensor
 from torch.utils.data import DataLoader
@@ -63,8 +62,8 @@ class CandidateSet(NamedTuple):
 def train_verification(
     runs: Path = Path("runs"),
     data: str = "shapes+assemblies+rooms",
-    pairs: int = 7000,
-    steps: int = 3500,
+    pairs: int = 30000,
+    steps: int = 10000,
     seed: int = 1,
     workers: int = 2,
 ) -> None:
@@ -105,10 +104,10 @@ def train_verification(
     checkpoints = folder / f"{seed}-{pairs}-{steps}"
     trainer = L.Trainer(
         max_steps=steps, max_epochs=-1, accelerator="cpu", logger=False,
-        enable_model_summary=False, enable_progress_bar=False, gradient_clip_val=1.0,
+        enable_model_summary=False, gradient_clip_val=1.0,
         callbacks=[
             ModelCheckpoint(checkpoints, every_n_train_steps=200, save_last=True),
-            PrintLoss(),
+            RichProgressBar(refresh_rate=10),
         ],
     )  # fmt: skip
     last = checkpoints / "last.ckpt"
@@ -142,7 +141,7 @@ def write_shard(path: Path, number: int, *, data: str, seed: int, count: int) ->
 def candidate_set(pairs: PairBatch, generate: NetworkHypotheses) -> CandidateSet:
     """Register a pair, a batch of one, up to its candidates, and label them."""
     source, target = (c[0].double().numpy() for c in (pairs.source, pairs.target))
-    (x, y), scale, subsamples, scorer = prepare_clouds(source, target, 0)
+    (x, y), scale, subsamples, (scorer,) = prepare_clouds(source, target, 0)
     hypotheses = generate(*subsamples, 0)
     truth = rigid.to_homogeneous(pairs.rotation[0], pairs.translation[0])
     truth = from_original_units(truth, scale, x.centre, y.centre)
@@ -194,29 +193,6 @@ class VerificationTraining(L.LightningModule):
         optimizer = torch.optim.AdamW(self.network.parameters(), RATE, weight_decay=1e-2)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, self.steps, pct_start=0.05)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
-
-
-class PrintLoss(L.Callback):
-    """A line of progress every hundred steps: mean loss, and the seconds that are left."""
-
-    def __init__(self) -> None:
-        self.losses: list[float] = []
-
-    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Start the clock."""
-        self.start, self.first = time.perf_counter(), trainer.global_step
-
-    def on_train_batch_end(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: dict, *_: object
-    ) -> None:
-        """Count a step."""
-        self.losses.append(float(outputs["loss"]))
-        step = trainer.global_step
-        if step % 100 == 0:
-            left = (time.perf_counter() - self.start) / (step - self.first)
-            left *= trainer.max_steps - step
-            print(f"step {step:,}  loss {np.mean(self.losses):.3f}  {left:,.0f} s left", flush=True)
-            self.losses.clear()
 
 
 def _turned(seen: Tensor) -> Tensor:
