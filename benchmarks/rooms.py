@@ -25,7 +25,7 @@ from corrmat.types import PairBatch
 
 RESULTS = Path(__file__).resolve().parents[1] / "results" / "register"
 POINTS, TEST_ROOMS, TUNING_ROOMS = 20_000, 60, 60
-VOXELS_M = {"ransac": (0.08, 0.12, 0.18, 0.27, 0.4), "kiss": (0.05, 0.07, 0.1, 0.15)}
+VOXELS_M = {"ransac": (0.08, 0.12, 0.18, 0.27, 0.4), "kiss": (0.035, 0.05, 0.07, 0.1, 0.15)}
 
 
 def ransac(source: np.ndarray, target: np.ndarray, voxel: float) -> np.ndarray:
