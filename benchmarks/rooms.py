@@ -3,7 +3,7 @@
     python benchmarks/rooms.py        minutes; needs pip install -e '.[baselines]'
 
 FPFH + RANSAC (Open3D) and KISS-Matcher get the whole clouds on a voxel grid. Its size is chosen on
-other rooms. All are refined by generalised ICP, coarse to fine, as ours. The record is
+other rooms. All are refined by the same generalised ICP, coarse to fine. The record is
 results/register/rooms-procedural-20000.json.
 """
 
@@ -17,8 +17,7 @@ from rich.progress import track
 
 from corrmat.baselines import FpfhSettings, KissSettings, fpfh_ransac, kiss_matcher
 from corrmat.registration import benchmark
-from corrmat.registration.preparation import LEVELS
-from corrmat.registration.scoring import AlignmentScorer, refine_coarse_to_fine
+from corrmat.registration.scoring import refine_coarse_to_fine, scorers_of_levels
 from corrmat.reporting.model_results import ModelResult, write_comparison
 from corrmat.revision import commit
 from corrmat.types import PairBatch
@@ -56,7 +55,7 @@ def run(pairs: PairBatch, name: str, voxel: float) -> ModelResult:
     for index in track(range(len(pairs)), f"{name}, {voxel} m", transient=True):
         source, target = (c[index].double().numpy() for c in (pairs.source, pairs.target))
         start = time.perf_counter()
-        scorers = [AlignmentScorer(source[:n], target[:n]) for n in LEVELS]
+        scorers = scorers_of_levels(source, target)
         transform = refine_coarse_to_fine(PIPELINES[name](source, target, voxel), scorers)
         ms = 1e3 * (time.perf_counter() - start)
         angle, adds = benchmark.errors(pairs, index, transform)

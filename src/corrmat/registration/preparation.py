@@ -1,6 +1,5 @@
 """A user's clouds become those that the model sees: checked, centred, scaled and subsampled."""
 
-import itertools
 from pathlib import Path
 from typing import NamedTuple
 
@@ -8,12 +7,10 @@ import numpy as np
 
 from corrmat.data.normals import estimate_normals
 from corrmat.errors import CorrmatError
-from corrmat.registration.scoring import AlignmentScorer
+from corrmat.registration.scoring import LEVELS, AlignmentScorer, scorers_of_levels
 
 MODEL_POINTS = 1024  # points of each cloud for the model
-SELECTION_POINTS = 2048  # to select among its hypotheses
-FULL_POINTS = 20_000  # at most, to refine the selected one
-LEVELS = SELECTION_POINTS, 6_000, FULL_POINTS  # of its refinement, coarse to fine
+FULL_POINTS = LEVELS[-1]  # at most, to refine the best of its hypotheses
 MEDIAN = 0.6  # median distance from the centroid after scaling: a radius of about one
 NORMAL_TOLERANCE = 0.01  # by which the length of a given normal may differ from one
 FAR = 30.0  # median distances from the middle: a point beyond is a stray one and left out
@@ -26,7 +23,7 @@ class PreparedClouds(NamedTuple):
     clouds: "tuple[Cloud, Cloud]"
     scale: float  # from the user's units to those in which a cloud's radius is about one
     subsamples: tuple[np.ndarray, np.ndarray]  # (N, 6) and (M, 6), for the model
-    scorers: list[AlignmentScorer]  # of at most `LEVELS` points, as many as the clouds need
+    scorers: list[AlignmentScorer]  # of more and more points
 
 
 def prepare_clouds(source: np.ndarray, target: np.ndarray, seed: int) -> PreparedClouds:
@@ -34,9 +31,7 @@ def prepare_clouds(source: np.ndarray, target: np.ndarray, seed: int) -> Prepare
     x, y = Cloud.of(source, "source", seed), Cloud.of(target, "target", seed)
     scale = 2 * MEDIAN / (x.median + y.median)
     subsamples = x.with_normals(scale, MODEL_POINTS), y.with_normals(scale, MODEL_POINTS)
-    most = max(len(x.rows), len(y.rows))
-    levels = [LEVELS[0], *(level for fewer, level in itertools.pairwise(LEVELS) if most > fewer)]
-    scorers = [AlignmentScorer(x.points(scale, n), y.points(scale, n)) for n in levels]
+    scorers = scorers_of_levels(x.points(scale, FULL_POINTS), y.points(scale, FULL_POINTS))
     return PreparedClouds((x, y), scale, subsamples, scorers)
 
 

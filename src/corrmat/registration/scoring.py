@@ -1,6 +1,7 @@
 """Refinement and scoring of a transform by how well it aligns two clouds."""
 
 import functools
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -12,6 +13,7 @@ from corrmat.data.normals import NEIGHBORS
 from corrmat.types import MATCH_DISTANCE
 
 COARSE_POINTS = 400  # of each cloud, to refine many transforms a little
+LEVELS = 2048, 6_000, 20_000  # points of each cloud, to select a transform and to refine it
 _TOO_SMALL = 10  # points, for small_gicp
 _SAME = 0.02  # of `max_distance`: points that lie nearer than this are one point
 _SHARED = 0.1  # share of the source's points that are the target's, too
@@ -92,7 +94,7 @@ class AlignmentScorer:
 
     def shares_points(self, transform: np.ndarray) -> bool:
         """Tell whether a transform puts a tenth of the source's points on target points."""
-        (distance, _), _ = self._nearest(transform)
+        distance, _ = self._nearest_target(transform)
         return bool(np.mean(distance < _SAME * self.max_distance) > _SHARED)
 
     def alignment(self, transform: np.ndarray) -> Alignment:
@@ -125,7 +127,7 @@ class AlignmentScorer:
 
         The RMS distance is NaN without any such point.
         """
-        (to_target, _), _ = self._nearest(transform)
+        to_target, _ = self._nearest_target(transform)
         near = to_target[to_target < self.max_distance]
         rmse = float(np.sqrt(np.mean(near**2))) if len(near) else np.nan
         return len(near) / len(to_target), rmse
@@ -137,17 +139,35 @@ class AlignmentScorer:
             Distances and indices: (N,) each for the source, (M,) each for the target. Where no
             point is near, the distance is infinite and the index is of any point.
         """
-        rotation, translation = transform[:3, :3], transform[:3, 3]
         source, target = self._trees
-        moved = source.data @ rotation.T + translation
-        back = (target.data - translation) @ rotation
-        return [self._query(target, moved), self._query(source, back)]
+        back = (target.data - transform[:3, 3]) @ transform[:3, :3]
+        return [self._nearest_target(transform), self._query(source, back)]
+
+    def _nearest_target(self, transform: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Find the nearest target point of every source point alone; see `_nearest`."""
+        source, target = self._trees
+        return self._query(target, source.data @ transform[:3, :3].T + transform[:3, 3])
 
     def _query(self, tree: KDTree, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Find the nearest point of a tree to each of `points`; see `_nearest`."""
         farthest = max(self.max_distance, MATCH_DISTANCE)
         distance, index = tree.query(points, distance_upper_bound=farthest)
         return np.asarray(distance), np.minimum(index, tree.n - 1)
+
+
+def scorers_of_levels(source: np.ndarray, target: np.ndarray) -> list[AlignmentScorer]:
+    """Return scorers of the first points of two clouds, coarse to fine; see `LEVELS`.
+
+    Args:
+        source: (N, 3), in random order.
+        target: (M, 3), the same.
+
+    Returns:
+        One for each level, up to the first that has all points.
+    """
+    most = max(len(source), len(target))
+    levels = [LEVELS[0], *(level for fewer, level in itertools.pairwise(LEVELS) if most > fewer)]
+    return [AlignmentScorer(source[:level], target[:level]) for level in levels]
 
 
 def refine_coarse_to_fine(transform: np.ndarray, scorers: Sequence[AlignmentScorer]) -> np.ndarray:
