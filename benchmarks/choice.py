@@ -42,14 +42,15 @@ from corrmat.types import PairBatch
 from corrmat.weights import load_model
 
 PATH = Path(__file__).resolve().parents[1] / "results" / "register" / "choice.json"
-_COHERENCE, _UNMATCHED, _SUPPORT, _VERIFICATION = CHOICE_WEIGHTS
+_COHERENCE, _UNMATCHED, _SUPPORT, _, _VERIFICATION = CHOICE_WEIGHTS
 _MEASURED = _COHERENCE, _UNMATCHED, _SUPPORT
-TRIED = [ChoiceWeights(*tried) for tried in (
+# Of coherence, unmatched loss, support and verification; clouds so small have no phase correlation.
+TRIED = (
     (0.0, 0.0, 0.0, 0.0), (1.5, 0.0, 0.0, 0.0), (_COHERENCE, 0.0, 0.0, 0.0),
     (0.0, _UNMATCHED, 0.0, 0.0), (0.0, 0.0, _SUPPORT, 0.0), (_COHERENCE, _UNMATCHED, 0.0, 0.0),
-    (*_MEASURED, 0.0), CHOICE_WEIGHTS, (*_MEASURED, _VERIFICATION / 2),
+    (*_MEASURED, 0.0), (*_MEASURED, _VERIFICATION), (*_MEASURED, _VERIFICATION / 2),
     (*_MEASURED, 2 * _VERIFICATION), (*_MEASURED, 20 * _VERIFICATION),
-)]  # fmt: skip
+)  # fmt: skip
 PAIRS: dict[benchmark.Protocol, int] = {"real": 200, "views": 120, "clean": 80}
 ANCHORS = 64, 256
 PRIORS = "without matches", "with matches"  # of EM-ICP
@@ -59,7 +60,7 @@ _SEED = 5  # of pairs that nothing else uses
 class CandidateTables(NamedTuple):
     """What candidates are worth; the last of them is the true transform."""
 
-    measures: np.ndarray  # (T + 1, 4) agreement, coherence, unmatched loss, support
+    measures: np.ndarray  # (T + 1, 5) of `measure`
     logits: np.ndarray  # (T + 1,) of the verification network
     errors: np.ndarray  # (2, T + 1, 2) degrees and ADD-S, after generalised ICP and after EM-ICP
 
@@ -77,7 +78,7 @@ class PairTables(NamedTuple):
 def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> PairTables:
     """Refine and measure the candidates of a pair, and the true transform in the same way."""
     source, target = (c[index].double().numpy() for c in (pairs.source, pairs.target))
-    (x, y), scale, subsamples, (scorer,) = prepare_clouds(source, target, 0)
+    (x, y), scale, subsamples, scorers = prepare_clouds(source, target, 0)
     hypotheses = generate(*subsamples, 0)
     truth = rigid.to_homogeneous(pairs.rotation[index], pairs.translation[index])
     truth = from_original_units(truth, scale, x.centre, y.centre)
@@ -86,16 +87,16 @@ def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> Pair
         in_units = [to_original_units(t, scale, x.centre, y.centre) for t in transforms]
         return np.array([benchmark.errors(pairs, index, t) for t in in_units])
 
-    found, measures = find_candidates(hypotheses, subsamples, scorer)
-    true = refine_some(truth[None], hypotheses, scorer)
+    found, measures = find_candidates(hypotheses, subsamples, scorers)
+    true = refine_some(truth[None], hypotheses, scorers[0])
     candidates = np.concatenate([found, true])
-    gicp = [scorer.refine(each) for each in candidates]
-    em = [refine_chosen(each, hypotheses, subsamples, [scorer]) for each in candidates]
+    gicp = [scorers[0].refine(each) for each in candidates]
+    em = [refine_chosen(each, hypotheses, subsamples, scorers) for each in candidates]
     return PairTables(
         len(hypotheses.transforms),
-        len(refine_some(hypotheses.transforms, hypotheses, scorer)),
+        len(refine_some(hypotheses.transforms, hypotheses, scorers[0])),
         CandidateTables(
-            np.concatenate([measures, measure(true, hypotheses, subsamples, scorer)]),
+            np.concatenate([measures, measure(true, hypotheses, subsamples, scorers)]),
             verify(candidates, hypotheses, subsamples),
             np.stack([errors_of(each) for each in (gicp, em)]),
         ),
@@ -126,7 +127,10 @@ def outcomes(table: PairTables) -> dict[str, np.ndarray]:
 
     found = len(measures) - 1
     rows = {
-        ", ".join(f"{weight:g}" for weight in tried): em[chosen(tried, found)] for tried in TRIED
+        ", ".join(f"{weight:g}" for weight in tried): em[
+            chosen(ChoiceWeights(*tried[:3], 0.0, tried[3]), found)
+        ]
+        for tried in TRIED
     }
     rows["in use, without half turns"] = em[chosen(CHOICE_WEIGHTS, table.unturned)]
     rows["best candidate"] = em[:-1].min(0)

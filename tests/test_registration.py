@@ -702,22 +702,23 @@ def test_only_a_network_with_matchabilities_says_which_points_have_no_match(gene
 
 
 def test_the_candidate_of_the_largest_weighted_sum_is_chosen():
-    measures = np.array([[0.5, 0.1, 0.1, 0.5], [0.6, 0.1, 0.5, 0.2], [0.5, 0.1, 0.1, 0.5]])
-    for others, best in (((0, 0, 0), 1), ((0, -1, 0), 0), ((0, 0, 0.5), 0)):
+    first = [0.5, 0.1, 0.1, 0.5, 0.2]
+    measures = np.array([first, [0.6, 0.1, 0.5, 0.2, 0.1], first])
+    for others, best in (((0, 0, 0, 0), 1), ((0, -1, 0, 0), 0), ((0, 0, 0.5, 0), 0), ((0, 0, 0, 2), 0)):
         weights = choice.ChoiceWeights(*others, 1.0)
         assert choice.choose(measures, weights, np.zeros_like) == best  # of equal ones, the first
 
 
 def test_the_verification_network_is_asked_for_the_best_candidates_alone(monkeypatch):
     monkeypatch.setattr(choice, "VERIFIED", 2)
-    measures = np.array([[0.5, 0, 0, 0], [0.6, 0, 0, 0], [0.1, 0, 0, 0]])
+    measures = np.array([[0.5, 0, 0, 0, 0], [0.6, 0, 0, 0, 0], [0.1, 0, 0, 0, 0]])
     logits, asked = np.array([1.0, -1.0, 9.0]), []
 
     def verified(some):
         asked.append(set(some.tolist()))
         return logits[some]
 
-    heavy, light = choice.ChoiceWeights(0, 0, 0, 1.0), choice.ChoiceWeights(0, 0, 0, 0.01)
+    heavy, light = choice.ChoiceWeights(0, 0, 0, 0, 1.0), choice.ChoiceWeights(0, 0, 0, 0, 0.01)
     assert choice.choose(measures, heavy, verified) == 0
     assert choice.choose(measures, light, verified) == 1
     assert choice.choose(measures[:1], heavy, verified) == 0
@@ -748,7 +749,7 @@ def test_half_a_turn_of_the_best_candidate_is_a_candidate_too():
     box[np.arange(600), np.arange(600) % 3] = np.sign(box[:, 0])
     box *= 1.2, 0.8, 0.5
     truth = rigid.to_homogeneous(Rotation.from_rotvec([0.3, -0.5, 1.0]).as_matrix(), np.ones(3))
-    (x, y), scale, subsamples, (scorer,) = preparation.prepare_clouds(
+    (x, y), scale, subsamples, scorers = preparation.prepare_clouds(
         box, box @ truth[:3, :3].T + truth[:3, 3], 0
     )
     truth = preparation.from_original_units(truth, scale, x.centre, y.centre)
@@ -759,11 +760,11 @@ def test_half_a_turn_of_the_best_candidate_is_a_candidate_too():
     for turn in turns:
         mistaken = Hypotheses(turn[None], np.empty((0, 2), int), np.empty(0))
         mistaken = mistaken._replace(verification=VerificationNetwork())
-        found, measures = choice.find_candidates(mistaken, subsamples, scorer)
+        found, measures = choice.find_candidates(mistaken, subsamples, scorers)
         assert len(found) == len(measures) == 4
         assert np.linalg.norm(found - truth, axis=(1, 2)).min() < 0.01
         alone = mistaken._replace(verification=None)  # as of ICP, which stays where it is
-        assert len(choice.find_candidates(alone, subsamples, scorer)[0]) == 1
+        assert len(choice.find_candidates(alone, subsamples, scorers)[0]) == 1
 
 
 def test_a_fragment_of_a_room_that_lies_right_stays_there():
@@ -786,14 +787,14 @@ def test_a_fragment_of_a_room_that_lies_right_stays_there():
 def test_the_choice_is_by_agreement_coherence_unmatched_loss_and_support(pair):
     """Of the truth and a half turn, put first, the truth wins, and by each measure's own weight."""
     _, source, target, truth = pair
-    (x, y), scale, subsamples, (scorer,) = preparation.prepare_clouds(source, target, 0)
+    (x, y), scale, subsamples, scorers = preparation.prepare_clouds(source, target, 0)
     hypotheses = NetworkHypotheses(load_model())(*subsamples, 0)
     prepared = preparation.from_original_units(truth, scale, x.centre, y.centre)
     back = preparation.to_original_units(prepared, scale, x.centre, y.centre)
     np.testing.assert_allclose(back, truth, atol=1e-9)
     transforms = np.stack([prepared] * 2)
     transforms[0, :3, :3] @= np.diag([-1.0, -1.0, 1.0])
-    wrong, right = choice.measure(transforms, hypotheses, subsamples, scorer)
+    wrong, right = choice.measure(transforms, hypotheses, subsamples, scorers)
     better = np.sign([1.0, *choice.CHOICE_WEIGHTS[:-1]]) * (right - wrong)
     assert (better[[0, 2, 3]] > 0).all()
     measures = np.stack([wrong, right])

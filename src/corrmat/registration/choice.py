@@ -8,6 +8,7 @@ import numpy as np
 from corrmat.ops import rigid
 from corrmat.registration.em_icp import WIDTHS, em_icp
 from corrmat.registration.hypotheses import Hypotheses
+from corrmat.registration.phase_correlation import PhaseCorrelation
 from corrmat.registration.preparation import MODEL_POINTS
 from corrmat.registration.scoring import (
     COARSE_POINTS,
@@ -22,11 +23,14 @@ class ChoiceWeights(NamedTuple):
     coherence: float
     unmatched_loss: float
     support: float
+    correlation: float  # phase correlation
     verification: float  # the logit of the verification network, for the best of the others' sum
 
 
-CHOICE_WEIGHTS = ChoiceWeights(4.0, -1.0, 0.2, 0.05)  # benchmarks/choice.py
-WITHOUT_MATCHABILITIES = ChoiceWeights(1.5, 0.0, 0.0, 0.0)  # for models that have none
+CHOICE_WEIGHTS = ChoiceWeights(4.0, -1.0, 0.2, 0.0, 0.05)  # benchmarks/choice.py
+LARGE_CLOUDS = ChoiceWeights(8.0, 0.0, 0.0, 5.0, 0.05)  # benchmarks/large_clouds.py
+WITHOUT_MATCHABILITIES = ChoiceWeights(1.5, 0.0, 0.0, 0.0, 0.0)  # for models that have none
+PEAKS = 16  # candidates from phase correlation
 HALF_TURNED = 3  # candidates at most
 VERIFIED = 8  # candidates at most
 CANDIDATE_STEPS = 5  # of generalised ICP, for each candidate; EM-ICP with matches does the rest
@@ -43,33 +47,62 @@ def distinct(transforms: np.ndarray) -> np.ndarray:
     return kept
 
 
+def phase_correlation(
+    hypotheses: Hypotheses, scorers: Sequence[AlignmentScorer]
+) -> PhaseCorrelation | None:
+    """Return the phase correlation of large clouds, for models with matches; None for all others.
+
+    Its grid is too fine for the few points of a small cloud.
+    """
+    if hypotheses.prob is None or len(scorers) == 1:
+        return None
+    return scorers[1].phase_correlation
+
+
+def weights_for(
+    hypotheses: Hypotheses, scorers: Sequence[AlignmentScorer]
+) -> ChoiceWeights:
+    """Return the weights of the choice among a model's candidates."""
+    if phase_correlation(hypotheses, scorers):
+        return LARGE_CLOUDS
+    return WITHOUT_MATCHABILITIES if hypotheses.unmatched_nll is None else CHOICE_WEIGHTS
+
+
 def find_candidates(
     hypotheses: Hypotheses,
     subsamples: tuple[np.ndarray, np.ndarray],
-    scorer: AlignmentScorer,
+    scorers: Sequence[AlignmentScorer],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Refine and measure hypotheses, drop copies, and add what the best may be mistaken for.
 
-    A thing that is nearly symmetric fits itself after half a turn. So the best candidates are
-    turned by 180 degrees about each principal axis as well, if a verification network can tell the
-    turned ones from the right one; the measures alone cannot.
+    In large clouds the peaks of their phase correlation are hypotheses, too. A thing that is nearly
+    symmetric fits itself after half a turn. So the best candidates are turned by 180 degrees about
+    each principal axis as well, if a verification network can tell the turned ones from the right
+    one; the measures alone cannot.
 
     Args:
         hypotheses: of the model.
         subsamples: the clouds that they were made from.
-        scorer: of the clouds.
+        scorers: of the clouds, of more and more of their points.
 
     Returns:
-        Transforms (T, 4, 4), half turns last, and their measures (T, 4).
+        Transforms (T, 4, 4), half turns last, and their measures (T, 5).
     """
-    refined = refine_some(hypotheses.transforms, hypotheses, scorer)
-    measures = measure(refined, hypotheses, subsamples, scorer)
+    scorer = scorers[0]
+    correlation = phase_correlation(hypotheses, scorers)
+    transforms = hypotheses.transforms
+    if correlation:
+        peaks = correlation.peaks(transforms[:, :3, :3], PEAKS)
+        transforms = np.concatenate([transforms, peaks])
+    refined = refine_some(transforms, hypotheses, scorer)
+    measures = measure(refined, hypotheses, subsamples, scorers)
     if hypotheses.verification is None:
         return refined, measures
-    best = refined[best_by_measures(measures, CHOICE_WEIGHTS, HALF_TURNED)]
+    weights = weights_for(hypotheses, scorers)
+    best = refined[best_by_measures(measures, weights, HALF_TURNED)]
     turned = np.concatenate([half_turned(each, subsamples) for each in best])
     every = distinct(np.concatenate([refined, refine_some(turned, hypotheses, scorer)]))
-    added = measure(every[len(refined) :], hypotheses, subsamples, scorer)
+    added = measure(every[len(refined) :], hypotheses, subsamples, scorers)
     return every, np.concatenate([measures, added])
 
 
@@ -104,7 +137,7 @@ def measure(
     transforms: np.ndarray,
     hypotheses: Hypotheses,
     subsamples: tuple[np.ndarray, np.ndarray],
-    scorer: AlignmentScorer,
+    scorers: Sequence[AlignmentScorer],
 ) -> np.ndarray:
     """Measure what the choice among transforms weighs.
 
@@ -112,17 +145,21 @@ def measure(
         transforms: (T, 4, 4).
         hypotheses: of the model.
         subsamples: the clouds that they were made from.
-        scorer: of the clouds to measure the transforms on; their first points are the model's.
+        scorers: of the clouds; the first points of each are the model's.
 
     Returns:
-        (T, 4): agreement, coherence, unmatched loss, support.
+        (T, 5): agreement, coherence, unmatched loss, support, and phase correlation (0 where it is
+        not used).
     """
+    correlation = phase_correlation(hypotheses, scorers)
     rows = []
     for transform in transforms:
-        agreement, coherence, distances = scorer.alignment(transform)
+        agreement, coherence, distances = scorers[0].alignment(transform)
+        unmatched = hypotheses.unmatched_loss(distances)
         support = hypotheses.support(transform, *subsamples)
-        rows.append((agreement, coherence, hypotheses.unmatched_loss(distances), support))
-    return np.reshape(rows, (-1, 4))
+        height = correlation.at(transform) if correlation else 0.0
+        rows.append((agreement, coherence, unmatched, support, height))
+    return np.reshape(rows, (-1, 5))
 
 
 def choose(
@@ -133,8 +170,8 @@ def choose(
     """Choose the candidate of the highest score; only the best by measures are verified.
 
     Args:
-        measures: (T, 4) of `measure`.
-        weights: of coherence, unmatched loss, support and verification, beside agreement's 1.
+        measures: (T, 5) of `measure`.
+        weights: beside agreement's 1.
         verified: what `verify` says of the candidates at (n,) indices.
     """
     best = best_by_measures(measures, weights, VERIFIED)
@@ -145,13 +182,13 @@ def choose(
 
 
 def best_by_measures(measures: np.ndarray, weights: ChoiceWeights, count: int) -> np.ndarray:
-    """Return the indices of the candidates of the highest sums of measures (T, 4), best first."""
+    """Return the indices of the candidates of the highest sums of measures (T, 5), best first."""
     return np.argsort(-weigh(measures, weights), kind="stable")[:count]
 
 
 def weigh(measures: np.ndarray, weights: ChoiceWeights) -> np.ndarray:
-    """Sum measures (T, 4) to scores (T,), without the verification."""
-    return measures @ [1.0, *weights[:3]]
+    """Sum measures (T, 5) to scores (T,), without the verification."""
+    return measures @ [1.0, *weights[:4]]
 
 
 def refine_chosen(

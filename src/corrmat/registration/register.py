@@ -12,12 +12,11 @@ from torch import nn
 from corrmat.calibration import Calibration, shipped_calibration, verdict
 from corrmat.errors import CorrmatError
 from corrmat.registration.choice import (
-    CHOICE_WEIGHTS,
-    WITHOUT_MATCHABILITIES,
     choose,
     find_candidates,
     measure,
     refine_chosen,
+    weights_for,
 )
 from corrmat.registration.hypotheses import CLASSICAL, HypothesisGenerator, NetworkHypotheses
 from corrmat.registration.preparation import prepare_clouds, to_original_units
@@ -76,18 +75,17 @@ def register(
     (x, y), scale, subsamples, scorers = prepare_clouds(source, target, seed)
     scorer, full = scorers[0], scorers[-1]
     hypotheses = generate(*subsamples, seed)
-    weights = WITHOUT_MATCHABILITIES if hypotheses.unmatched_nll is None else CHOICE_WEIGHTS
 
     if refine == "icp":
-        candidates, measures = find_candidates(hypotheses, subsamples, scorer)
+        candidates, measures = find_candidates(hypotheses, subsamples, scorers)
     else:
         candidates = hypotheses.transforms
-        measures = measure(candidates, hypotheses, subsamples, scorer)
+        measures = measure(candidates, hypotheses, subsamples, scorers)
 
     def verified(some: np.ndarray) -> np.ndarray:
         return verify(candidates[some], hypotheses, subsamples)
 
-    transform = candidates[choose(measures, weights, verified)]
+    transform = candidates[choose(measures, weights_for(hypotheses, scorers), verified)]
     if refine == "icp":
         transform = refine_chosen(transform, hypotheses, subsamples, scorers)
     agreement = scorer.alignment(transform).agreement

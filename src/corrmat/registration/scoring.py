@@ -10,6 +10,7 @@ import small_gicp
 from scipy.spatial import KDTree
 
 from corrmat.data.normals import NEIGHBORS
+from corrmat.registration.phase_correlation import PhaseCorrelation
 from corrmat.types import MATCH_DISTANCE
 
 COARSE_POINTS = 400  # of each cloud, to refine many transforms a little
@@ -61,10 +62,16 @@ class AlignmentScorer:
         return clouds[0], clouds[1], small_gicp.KdTree(clouds[1])
 
     @functools.cached_property
-    def _normals(self) -> tuple[np.ndarray, np.ndarray]:
+    def normals(self) -> tuple[np.ndarray, np.ndarray]:
         """Unit normals of source (N, 3) and target (M, 3), of any sign."""
         source, target, _ = self._clouds
         return np.asarray(source.normals())[:, :3], np.asarray(target.normals())[:, :3]
+
+    @functools.cached_property
+    def phase_correlation(self) -> PhaseCorrelation:
+        """Phase correlation of the two clouds."""
+        source, target = map(np.hstack, zip((self.source, self.target), self.normals, strict=True))
+        return PhaseCorrelation(source, target)
 
     @functools.cached_property
     def coarse(self) -> "AlignmentScorer":
@@ -99,7 +106,7 @@ class AlignmentScorer:
 
     def alignment(self, transform: np.ndarray) -> Alignment:
         """Measure how well a transform (4, 4) puts the clouds on each other."""
-        normals, target_normals = self._normals
+        normals, target_normals = self.normals
         moved = normals @ transform[:3, :3].T
         (distance, index), (back_distance, back_index) = self._nearest(transform)
         sides = (

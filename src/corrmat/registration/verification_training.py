@@ -141,14 +141,14 @@ def write_shard(path: Path, number: int, *, data: str, seed: int, count: int) ->
 def candidate_set(pairs: PairBatch, generate: NetworkHypotheses) -> CandidateSet:
     """Register a pair, a batch of one, up to its candidates, and label them."""
     source, target = (c[0].double().numpy() for c in (pairs.source, pairs.target))
-    (x, y), scale, subsamples, (scorer,) = prepare_clouds(source, target, 0)
+    (x, y), scale, subsamples, scorers = prepare_clouds(source, target, 0)
     hypotheses = generate(*subsamples, 0)
     truth = rigid.to_homogeneous(pairs.rotation[0], pairs.translation[0])
     truth = from_original_units(truth, scale, x.centre, y.centre)
-    found, measures = find_candidates(hypotheses, subsamples, scorer)
+    found, measures = find_candidates(hypotheses, subsamples, scorers)
     best = found[best_by_measures(measures, CHOICE_WEIGHTS, VERIFIED)]
-    true = refine_some(truth[None], hypotheses, scorer)
-    turned = refine_some(half_turned(true[0], subsamples), hypotheses, scorer)
+    true = refine_some(truth[None], hypotheses, scorers[0])
+    turned = refine_some(half_turned(true[0], subsamples), hypotheses, scorers[0])
     transforms = np.concatenate([best, turned, true])
     points = subsamples[0][:, :3]
     offsets = points @ (transforms - truth)[:, :3, :3].transpose(0, 2, 1)
