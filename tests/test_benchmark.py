@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from corrmat.cli import main
 from corrmat.data import registry
-from corrmat.data.room_pairs import OVERLAP, make_room_pair
+from corrmat.data.scan_pairs import OVERLAP, make_object_pair, make_room_pair
 from corrmat.errors import CorrmatError
 from corrmat.registration import benchmark, shipping
 from corrmat.reporting import comparisons
@@ -45,7 +45,7 @@ def test_who_knows_the_truth_scores_everything_and_who_does_not_nothing(pairs, m
             transform[:3, :3] = transform[:3, :3] @ np.diag([1.0, -1, -1])
         result = type("Result", (), {})()
         result.transform, result.seconds = transform, 0.01
-        result.agreement, result.support = 1.0, 1.0
+        result.agreement, result.support, result.large = 1.0, 1.0, ()
         return result
 
     monkeypatch.setattr(benchmark, "register", answer)
@@ -78,7 +78,7 @@ def test_the_command_prints_one_table_and_writes_a_record(pairs, tmp_path, capsy
     confidence = comparisons.confidence_table(tmp_path / "results")
     rows = [row.split(" | ") for row in confidence.splitlines() if "| shapes |" in row]
     assert sum(int(row[2]) for row in rows) == 4
-    assert "4 pairs of single objects: expected calibration error over 10 bins 0." in confidence
+    assert "4 pairs of small clouds: expected calibration error over 10 bins 0." in confidence
 
 
 def test_calibration_intervals_and_paired_test_by_hand():
@@ -147,3 +147,23 @@ def test_rooms_are_a_protocol():
     truth[:3, :3], truth[:3, 3] = pairs.rotation[1], pairs.translation[1]
     assert max(benchmark.errors(pairs, 1, truth)) < 1e-4
     assert set(benchmark.compare(pairs, ["icp"])) == {"icp"}
+
+
+@pytest.mark.parametrize("index", [0, 1])  # what cameras see, and crops
+def test_dense_scans_of_an_object_lie_on_each_other(index):
+    pair, again = (make_object_pair(index, 2000, "test") for _ in range(2))
+    np.testing.assert_array_equal(pair.source, again.source)
+    moved = pair.source @ pair.rotation.T + pair.translation
+    near = KDTree(pair.target).query(moved)[0] < 0.1
+    assert 0.25 < near.mean() < 1  # a part of the object is in one scan alone
+    assert KDTree(pair.target).query(moved)[0].min() > 0  # no shared point
+    assert not np.array_equal(pair.source, make_object_pair(index, 2000, "val").source)
+
+
+def test_scans_of_fewer_points_repeat_some_in_a_batch():
+    few = benchmark.SCANS["dense"](0, 50, "test")
+    many = few._replace(source=np.vstack([few.source, few.source[:7] + 1]))
+    pairs = benchmark._pair_scans([few, many])
+    np.testing.assert_array_equal(pairs.source[0, 50:], few.source[:7])
+    np.testing.assert_array_equal(pairs.source[1], many.source)
+    assert pairs.target.shape == (2, 50, 3)

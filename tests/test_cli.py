@@ -213,9 +213,10 @@ def test_an_option_with_a_made_up_suffix_is_not_taken_for_the_option(words, caps
     assert f"unknown option {words[-2]}" in capsys.readouterr().err
 
 
-def test_rooms_are_of_no_data_set(capsys):
-    assert main(["compare", "icp", "--protocol", "rooms", "--data", "modelnet40"]) == 2
-    assert "rooms are procedural" in capsys.readouterr().err
+@pytest.mark.parametrize("protocol", ["rooms", "dense"])
+def test_dense_scans_are_of_no_data_set(protocol, capsys):
+    assert main(["compare", "icp", "--protocol", protocol, "--data", "modelnet40"]) == 2
+    assert f"{protocol} pairs are procedural" in capsys.readouterr().err
 
 
 def test_a_checkpoint_of_another_scale_is_named(tmp_path, capsys):

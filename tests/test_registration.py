@@ -20,7 +20,7 @@ from corrmat.baselines import fpfh_ransac
 from corrmat.calibration import SURE, verdict
 from corrmat.cli import main
 from corrmat.data.normals import estimate_normals
-from corrmat.data.room_pairs import make_room_pair
+from corrmat.data.scan_pairs import make_room_pair
 from corrmat.data.scans import read_scan, write_ply
 from corrmat.data.shapes.dataset import make_shape
 from corrmat.errors import CorrmatError
@@ -704,7 +704,12 @@ def test_only_a_network_with_matchabilities_says_which_points_have_no_match(gene
 def test_the_candidate_of_the_largest_weighted_sum_is_chosen():
     first = [0.5, 0.1, 0.1, 0.5, 0.2]
     measures = np.array([first, [0.6, 0.1, 0.5, 0.2, 0.1], first])
-    for others, best in (((0, 0, 0, 0), 1), ((0, -1, 0, 0), 0), ((0, 0, 0.5, 0), 0), ((0, 0, 0, 2), 0)):
+    for others, best in (
+        ((0, 0, 0, 0), 1),
+        ((0, -1, 0, 0), 0),
+        ((0, 0, 0.5, 0), 0),
+        ((0, 0, 0, 2), 0),
+    ):
         weights = choice.ChoiceWeights(*others, 1.0)
         assert choice.choose(measures, weights, np.zeros_like) == best  # of equal ones, the first
 
@@ -802,3 +807,18 @@ def test_the_choice_is_by_agreement_coherence_unmatched_loss_and_support(pair):
     wrongly, rightly = verify(transforms, hypotheses, subsamples)
     assert rightly > wrongly
     assert not verify(transforms, hypotheses._replace(verification=None), subsamples).any()
+
+
+def test_a_room_whose_matches_are_wrong_is_registered_by_phase_correlation(monkeypatch):
+    """Without it, this fragment comes out metres away."""
+    room = make_room_pair(208, 20_000, "val")
+    truth = rigid.to_homogeneous(room.rotation, room.translation)
+
+    def moved_m():
+        off = corrmat.register(room.source, room.target).transform - truth
+        return np.linalg.norm(room.source @ off[:3, :3].T + off[:3, 3], axis=1).mean()
+
+    assert moved_m() < 0.02
+    for module in (choice, sys.modules["corrmat.registration.register"]):
+        monkeypatch.setattr(module, "phase_correlation", lambda hypotheses, scorers: None)
+    assert moved_m() > 1

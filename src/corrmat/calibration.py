@@ -1,6 +1,7 @@
 """From the scores of a registration to a confidence, and from a confidence to words."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,24 +24,30 @@ def verdict(confidence: float, reason: str) -> str:
 class Calibration:
     """Logistic curves from the scores of a registration to the chance that it is right.
 
-    Coefficients are over (agreement, support, 1), and over (agreement, 1) for models without
-    matches; `registration.shipping.calibrate` fits them.
+    Coefficients are over (agreement, support, 1); over (agreement, support, coherence, phase
+    correlation, 1) for large clouds; and over (agreement, 1) for models without matches.
+    `registration.shipping.calibrate` fits them.
     """
 
     both: list[float]
+    large: list[float]
     agreement: list[float]
 
-    def confidence(self, agreement: float, support: float | None) -> float:
+    def confidence(
+        self, agreement: float, support: float | None, large: Sequence[float] = ()
+    ) -> float:
         """Compute the chance that a registration is right.
 
         Args:
             agreement: of the two clouds, in [0, 1].
             support: of the matches, in [0, 1]; None for a model without matches.
+            large: coherence and phase correlation of large clouds.
         """
         if support is None:
             logit = np.dot(self.agreement, [agreement, 1.0])
         else:
-            logit = np.dot(self.both, [agreement, support, 1.0])
+            coefficients = self.large if large else self.both
+            logit = np.dot(coefficients, [agreement, support, *large, 1.0])
         return float(1 / (1 + np.exp(-logit)))
 
 

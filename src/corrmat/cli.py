@@ -238,9 +238,12 @@ def _compare(options: Namespace) -> int:
         _refuse_folder(options.record)
         ensure_writable(options.record.parent)
     about = {name: options[name] for name in ("protocol", "data", "points")}
-    if options.protocol == "rooms":
+    if options.protocol in benchmark.SCANS:
         if options.data != "shapes" or options.root:
-            raise CorrmatError("rooms are procedural: --data and --root go with other protocols")
+            raise CorrmatError(
+                f"{options.protocol} pairs are procedural: "
+                "--data and --root go with other protocols"
+            )
         about["data"] = "procedural"
     code = commit() if options.record is not None else None
     pairs = benchmark.frozen_pairs(**about, root=options.root, count=options.pairs)

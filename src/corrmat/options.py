@@ -72,6 +72,7 @@ protocols:
           each cloud without 30 % of its points
   views   what two depth cameras see of one shape, up to 60 degrees apart
   clean   real without crop and outliers
+  dense   dense scans of one procedural object: cropped, or seen by a camera (--points 20000)
   rooms   fragments of procedural rooms, in metres (--points 20000)
   paper   the pairs of experiment 1.2
 
@@ -283,7 +284,7 @@ def _add_compare_options(parser: ArgumentParser) -> None:
     parser.add_argument("models", help="e.g. corrmat,ransac,fgr,icp or checkpoint files")
     parser.add_argument(
         "--protocol",
-        type=Literal["paper", "real", "views", "clean", "rooms"],
+        type=Literal["paper", "real", "views", "clean", "dense", "rooms"],
         default="real",
         help="see below",
     )

@@ -1,7 +1,7 @@
 """Compare models on the same frozen pairs: what `corrmat compare` prints."""
 
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -13,14 +13,14 @@ from scipy.spatial import KDTree
 
 from corrmat.data.pairs import STREAM, Key, PairSettings, Split, make_pairs
 from corrmat.data.registry import load_clouds
-from corrmat.data.room_pairs import make_room_pair
+from corrmat.data.scan_pairs import ScanPair, make_object_pair, make_room_pair
 from corrmat.errors import CorrmatError
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG, rotation_error_deg
 from corrmat.registration.register import register
-from corrmat.reporting.model_results import ModelResult
+from corrmat.reporting.model_results import LARGE, ModelResult
 from corrmat.types import PairBatch
 
-Protocol = Literal["paper", "real", "views", "clean", "rooms"]
+Protocol = Literal["paper", "real", "views", "clean", "dense", "rooms"]
 # Two scans: no shared point, noise, both clouds cropped, outliers, normals estimated.
 _SCANS = PairSettings(
     keep=0.7,
@@ -39,6 +39,10 @@ PROTOCOLS: dict[Protocol, PairSettings] = {
     # Two scans without crop and outliers.
     "clean": PairSettings(sampling="disjoint", jitter=0.01, normals="estimated"),
 }
+# Dense scans: of single objects, and of rooms in metres.
+SCANS: dict[Protocol, Callable[[int, int, Split], ScanPair]] = {
+    "dense": make_object_pair, "rooms": make_room_pair,
+}  # fmt: skip
 COLUMNS = {
     "mean_deg": "mean °",
     "median_deg": "median °",
@@ -56,6 +60,7 @@ class Outcome(NamedTuple):
     ms: float
     agreement: float
     support: float
+    large: tuple[float, ...] = ()  # see `Registration`
 
 
 def frozen_pairs(
@@ -69,7 +74,7 @@ def frozen_pairs(
     """Draw the pairs of a protocol: every model gets the same, on every machine.
 
     Args:
-        protocol: one of `PROTOCOLS`; or "rooms": fragments of procedural rooms, in metres.
+        protocol: one of `PROTOCOLS` or of `SCANS`, which need no data set.
         data: name of the data set.
         root: folder of the data set.
         points: of a cloud before it is cropped.
@@ -79,8 +84,8 @@ def frozen_pairs(
     Raises:
         CorrmatError: the data set cannot be read, or has too few points.
     """
-    if protocol == "rooms":
-        return _room_pairs(points, count, split)
+    if protocol in SCANS:
+        return _pair_scans([SCANS[protocol](index, points, split) for index in range(count)])
     clouds = load_clouds(data, "test" if split == "test" else "train", None, root)
     settings = replace(PROTOCOLS[protocol], num_points=points)
     if settings.min_cloud_points > clouds.num_points:
@@ -93,16 +98,31 @@ def frozen_pairs(
     return make_pairs(clouds, chosen.tolist(), keys, settings)
 
 
-def _room_pairs(points: int, count: int, split: Split) -> PairBatch:
-    """Make pairs of fragments of rooms, without normals; their `clean` cloud is the source."""
-    pairs = [make_room_pair(index, points, split) for index in range(count)]
-    source, target, rotation, translation = (
-        torch.from_numpy(np.stack([getattr(pair, name) for pair in pairs]))
-        for name in ("source", "target", "rotation", "translation")
+def _pair_scans(pairs: Sequence[ScanPair]) -> PairBatch:
+    """Put scans into a batch, without normals; their `clean` clouds are of the sources.
+
+    A scan that has fewer points than the largest one repeats some: points that are there more than
+    once count once.
+    """
+    source, target = (
+        np.stack([_repeated(getattr(pair, name), most) for pair in pairs])
+        for name in ("source", "target")
+        for most in [max(len(getattr(pair, name)) for pair in pairs)]
     )
-    index = torch.arange(count)
-    none = torch.full((count, points), points)
+    rotation, translation = (
+        np.stack([getattr(pair, name) for pair in pairs]) for name in ("rotation", "translation")
+    )
+    none = torch.full(source.shape[:2], target.shape[1])
+    source, target, rotation, translation = map(
+        torch.from_numpy, (source, target, rotation, translation)
+    )
+    index = torch.arange(len(pairs))
     return PairBatch(source, target, rotation, translation, none, source[:, :2048], index)
+
+
+def _repeated(points: np.ndarray, count: int) -> np.ndarray:
+    """Repeat the points of a cloud (N, 3) to `count`."""
+    return points[np.arange(count) % len(points)]
 
 
 def compare(pairs: PairBatch, models: Sequence[str]) -> dict[str, ModelResult]:
@@ -128,7 +148,7 @@ def compare(pairs: PairBatch, models: Sequence[str]) -> dict[str, ModelResult]:
 
 def summarise(pairs: PairBatch, outcomes: Sequence[Outcome]) -> ModelResult:
     """Compute a model's result from its outcome on every pair."""
-    angle, adds, ms, agreement, support = (np.array(c) for c in zip(*outcomes, strict=True))
+    angle, adds, ms, agreement, support, large = map(np.array, zip(*outcomes, strict=True))
     return ModelResult(
         mean_deg=float(angle.mean()),
         median_deg=float(np.median(angle)),
@@ -141,6 +161,7 @@ def summarise(pairs: PairBatch, outcomes: Sequence[Outcome]) -> ModelResult:
             "adds": np.round(adds, 5).tolist(),
             "agreement": np.round(agreement, 4).tolist(),
             "support": np.round(support, 4).tolist(),
+            **dict(zip(LARGE, np.round(large, 4).T.tolist(), strict=bool(large.size))),
         },
     )
 
@@ -163,7 +184,9 @@ def _register_pair(pairs: PairBatch, index: int, model: str) -> Outcome:
     source, target = (c[index].double().numpy() for c in (pairs.source, pairs.target))
     result = register(source, target, model=model)
     angle, adds = errors(pairs, index, result.transform)
-    return Outcome(angle, adds, 1e3 * result.seconds, result.agreement, result.support)
+    return Outcome(
+        angle, adds, 1e3 * result.seconds, result.agreement, result.support, result.large
+    )
 
 
 def errors(pairs: PairBatch, index: int, transform: np.ndarray) -> tuple[float, float]:

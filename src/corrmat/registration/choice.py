@@ -59,9 +59,7 @@ def phase_correlation(
     return scorers[1].phase_correlation
 
 
-def weights_for(
-    hypotheses: Hypotheses, scorers: Sequence[AlignmentScorer]
-) -> ChoiceWeights:
+def weights_for(hypotheses: Hypotheses, scorers: Sequence[AlignmentScorer]) -> ChoiceWeights:
     """Return the weights of the choice among a model's candidates."""
     if phase_correlation(hypotheses, scorers):
         return LARGE_CLOUDS

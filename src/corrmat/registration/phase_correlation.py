@@ -7,7 +7,6 @@ furniture count, and not the number of points that a wall has.
 """
 
 import numpy as np
-from scipy import fft
 from scipy.ndimage import maximum_filter
 from scipy.spatial.transform import Rotation
 
@@ -38,8 +37,8 @@ class PhaseCorrelation:
             manhattan_frame(cloud[:_FRAME_NORMALS, 3:]) for cloud in (source, target)
         )
         radii = sum(np.linalg.norm(cloud[:, :3], axis=1).max() for cloud in (source, target))
-        voxels = min(int(np.ceil(2 * _FARTHEST * radii / _VOXEL)), _MOST_VOXELS)
-        self._size = fft.next_fast_len(voxels, real=True)
+        voxels = min(2 * _FARTHEST * radii / _VOXEL, _MOST_VOXELS)
+        self._size = 4 * int(np.ceil(voxels / 4))  # of small factors, for the Fourier transform
         self._target = self._phases(target, self._target_frame)
 
     def peaks(self, rotations: np.ndarray, count: int) -> np.ndarray:
@@ -70,13 +69,15 @@ class PhaseCorrelation:
         return float(heights[np.ix_(_NEXT, _NEXT, _NEXT)].max())
 
     def _correlate(self, rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
-        """Correlate the moved source with the target: (size, size, size), for each further shift."""
-        moved = np.hstack([self._source[:, :3] @ rotation.T + translation, self._source[:, 3:] @ rotation.T])
+        """Correlate the moved source with the target, (size, size, size): one for each shift."""
+        points, normals = np.hsplit(self._source, 2)
+        moved = np.hstack([points @ rotation.T + translation, normals @ rotation.T])
         source = self._phases(moved, self._target_frame)
-        return fft.irfftn((source.conj() * self._target).sum(0), [self._size] * 3)
+        product = (source.conj() * self._target).sum(0)
+        return np.fft.irfftn(product, [self._size] * 3, axes=(0, 1, 2))
 
     def _phases(self, cloud: np.ndarray, frame: np.ndarray) -> np.ndarray:
-        """Compute the spectra of four grids, of magnitude one: surfaces along each axis, and others.
+        """Compute spectra of magnitude one of four grids: surfaces along each axis, and others.
 
         Args:
             cloud: (N, 6).
@@ -90,7 +91,7 @@ class PhaseCorrelation:
         voxels = np.round(cloud[:, :3] @ frame.T / _VOXEL).astype(int) % self._size
         grid = np.zeros((4, *[self._size] * 3), np.float32)
         grid[kind, *voxels.T] = 1
-        spectrum = fft.rfftn(grid, axes=(1, 2, 3))
+        spectrum = np.fft.rfftn(grid, axes=(1, 2, 3))
         magnitude = np.abs(spectrum)
         return spectrum / (magnitude + _FLOOR * magnitude.max())
 
@@ -104,7 +105,7 @@ def manhattan_frame(normals: np.ndarray) -> np.ndarray:
     Returns:
         (3, 3), a rotation whose rows are the axes.
     """
-    axes = Rotation.random(_STARTS, rng=0).as_matrix()
+    axes = Rotation.random(_STARTS, rng=np.random.default_rng(0)).as_matrix()
     for _ in range(_STEPS):
         u, _, v = np.linalg.svd(((normals @ axes.mT) ** 3).mT @ normals)
         axes = u @ v

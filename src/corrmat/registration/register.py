@@ -15,6 +15,7 @@ from corrmat.registration.choice import (
     choose,
     find_candidates,
     measure,
+    phase_correlation,
     refine_chosen,
     weights_for,
 )
@@ -73,7 +74,6 @@ def register(
         generate = CLASSICAL.get(str(model)) or _load_network(str(model))
     start = time.perf_counter()
     (x, y), scale, subsamples, scorers = prepare_clouds(source, target, seed)
-    scorer, full = scorers[0], scorers[-1]
     hypotheses = generate(*subsamples, seed)
 
     if refine == "icp":
@@ -88,14 +88,16 @@ def register(
     transform = candidates[choose(measures, weights_for(hypotheses, scorers), verified)]
     if refine == "icp":
         transform = refine_chosen(transform, hypotheses, subsamples, scorers)
-    agreement = scorer.alignment(transform).agreement
+    agreement, coherence, _ = scorers[0].alignment(transform)
     support = hypotheses.support(transform, *subsamples)
     agrees = hypotheses.match_support(transform, *subsamples) > 0
-    confidence = _calibration().confidence(agreement, support if len(agrees) else None)
+    correlation = phase_correlation(hypotheses, scorers)
+    large = (coherence, correlation.at(transform)) if correlation else ()
+    confidence = _calibration().confidence(agreement, support if len(agrees) else None, large)
     fewest = min(len(x.rows), len(y.rows))
     if fewest < FEW_POINTS or (len(agrees) and not agrees.any()):
         confidence = min(confidence, DOUBTFUL)
-    overlap, rmse = full.overlap_and_rmse(transform)
+    overlap, rmse = scorers[-1].overlap_and_rmse(transform)
     rows = [cloud.rows[m] for cloud, m in zip((x, y), hypotheses.matches.T, strict=True)]
     return Registration(
         transform=to_original_units(transform, scale, x.centre, y.centre),
@@ -104,6 +106,7 @@ def register(
         match_agrees=agrees,
         agreement=agreement,
         support=support,
+        large=large,
         confidence=confidence,
         rmse=rmse / scale,
         overlap=overlap,

@@ -3,7 +3,7 @@
 import itertools
 import json
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -23,6 +23,8 @@ from corrmat.types import PairBatch
 
 CALIBRATION_PAIRS = {512: 200, 1024: 100}  # of a protocol, by points of a cloud
 CALIBRATION_PROTOCOLS: tuple[benchmark.Protocol, ...] = ("real", "views", "clean")
+CALIBRATION_SCANS = 150  # pairs of each protocol of large clouds
+SCAN_POINTS = 20_000
 
 
 def ship(
@@ -89,16 +91,18 @@ def add_training(results: Path, run: TrainingRun) -> None:
 def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:
     """Fit the chance that a pair is aligned to its agreement and support.
 
-    Logistic regression on held-out pairs of three difficulties; `Calibration` applies it. The curve
-    over the agreement alone, for models without matches, is fitted on ICP's outcomes as well: most
-    of them are wrong, where few of the network's are.
+    Logistic regression on held-out pairs of three difficulties, and of large clouds on a curve of
+    their own; `Calibration` applies it. The curve over the agreement alone, for models without
+    matches, is fitted on ICP's outcomes as well: most of them are wrong, where few of the
+    network's are.
 
     Args:
         model: as `register` takes it.
 
     Returns:
-        Coefficients over (agreement, support, 1) and over (agreement, 1); and the share of each
-        protocol's pairs of 512 points that are within 5 degrees.
+        Coefficients over (agreement, support, 1), of large clouds over (agreement, support,
+        coherence, phase correlation, 1), and over (agreement, 1); and the share of each protocol's
+        pairs of 512 points, and of large clouds, that are within 5 degrees.
     """
     scores, aligned, recalls = [], [], {}
     agreements, aligned_alone = [], []
@@ -112,15 +116,26 @@ def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:
         for result in results.values():
             agreements += result.per_pair["agreement"]
             aligned_alone += result.aligned.tolist()
-    both = _fit_logistic(np.array(scores), np.array(aligned, float))
-    alone = _fit_logistic(np.array(agreements)[:, None], np.array(aligned_alone, float))
-    curve = Calibration(both, alone)
-    sure = np.array([curve.confidence(*score) >= SURE for score in scores])
-    wrongly = np.mean(sure & ~np.array(aligned))
-    print(
-        f'called "aligned": {sure.mean():.1%} of {len(sure)} held-out pairs, {wrongly:.1%} wrongly'
+    large_scores, large_aligned = [], []
+    for protocol in benchmark.SCANS:
+        pairs = benchmark.frozen_pairs(
+            protocol, points=SCAN_POINTS, count=CALIBRATION_SCANS, split="val"
+        )
+        (result,) = benchmark.compare(pairs, [model]).values()
+        recalls[protocol] = result.recall_5deg
+        large_scores += result.scores.tolist()
+        large_aligned += result.aligned.tolist()
+    curve = Calibration(
+        both=_fit_logistic(np.array(scores), np.array(aligned, float)),
+        large=_fit_logistic(np.array(large_scores), np.array(large_aligned, float)),
+        agreement=_fit_logistic(np.array(agreements)[:, None], np.array(aligned_alone, float)),
     )
-    return {"both": both, "agreement": alone}, recalls
+    for of, right in ((scores, aligned), (large_scores, large_aligned)):
+        sure = np.array([curve.confidence(a, b, large) >= SURE for a, b, *large in of])
+        wrongly = np.mean(sure & ~np.array(right))
+        called = f"{sure.mean():.1%} of {len(of)} held-out pairs, {wrongly:.1%} wrongly"
+        print(f'called "aligned": {called}')
+    return asdict(curve), recalls
 
 
 def held_out_pairs(

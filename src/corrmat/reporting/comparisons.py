@@ -17,8 +17,10 @@ from corrmat.weights import shipped_metadata
 
 OURS = "corrmat"
 TRAINING = Path("register", "training.json")  # below results/: how the shipped weights were trained
-_PROTOCOLS = ("real", "views", "clean", "rooms")  # in the order of the tables
-_KINDS = {"single objects": ("shapes", "modelnet40"), "rooms": ("procedural",)}  # data sets of each
+_PROTOCOLS = ("real", "views", "clean", "dense", "rooms")  # in the order of the tables
+_SMALL = "real", "views", "clean"  # clouds of at most 1,024 points
+# Protocols of each kind of clouds.
+_KINDS = {"small clouds": _SMALL, "dense scans of objects": ("dense",), "rooms": ("rooms",)}
 _BINS = 10  # of the expected calibration error
 
 
@@ -37,7 +39,7 @@ class TrainingRun(TypedDict):
 
 def comparison_summary(results: Path) -> str:
     """Build README's table: recall at 5 degrees of every model, ours with its interval."""
-    records = [r for r in _read_comparisons(results) if r.protocol != "rooms"]
+    records = [r for r in _read_comparisons(results) if r.protocol in _SMALL]
     if not records:
         return "No comparison is recorded; `make protocols` makes them."
     models = list(records[0].models)
@@ -150,17 +152,16 @@ def choice_table(results: Path) -> str:
 def confidence_table(results: Path) -> str:
     """Build the table of verdicts: what their confidence promised, and what was so.
 
-    Below it stands the expected calibration error, of single objects and of rooms.
+    Below it stands the expected calibration error of each kind of clouds.
     """
     heads = ["verdict", "data", "pairs", "promised", "aligned", "wrong"]
     lines, summaries = markdown_head(heads), []
     comparisons = _read_comparisons(results)
-    for what, data_sets in _KINDS.items():
+    for what, protocols in _KINDS.items():
         both = []
-        for data in data_sets:
-            ours = [c.models[OURS] for c in comparisons if c.data == data]
-            if not ours:
-                continue
+        records = [c for c in comparisons if c.protocol in protocols]
+        for data in sorted({c.data for c in records}, reverse=True):
+            ours = [c.models[OURS] for c in records if c.data == data]
             promised = np.concatenate([_confidence(result) for result in ours])
             aligned = np.concatenate([result.aligned for result in ours])
             both.append((promised, aligned))
@@ -170,7 +171,8 @@ def confidence_table(results: Path) -> str:
                 if inside.any():
                     means = [f"{values[inside].mean():.0%}" for values in (promised, aligned)]
                     counts = [str(number) for number in (inside.sum(), (inside & ~aligned).sum())]
-                    lines.append(markdown_row([words, data, counts[0], *means, counts[1]]))
+                    about = data if protocols == _SMALL else protocols[0]
+                    lines.append(markdown_row([words, about, counts[0], *means, counts[1]]))
         if both:
             promised, aligned = map(np.concatenate, zip(*both, strict=True))
             error = expected_calibration_error(promised, aligned)
@@ -262,7 +264,7 @@ def _read_comparisons(results: Path) -> list[Comparison]:
 def _confidence(result: ModelResult) -> np.ndarray:
     """Compute what the shipped calibration promised for each pair."""
     calibration = shipped_calibration()
-    return np.array([calibration.confidence(*score) for score in result.scores])
+    return np.array([calibration.confidence(a, b, large) for a, b, *large in result.scores])
 
 
 def _recall_cells(result: ModelResult, ours: np.ndarray | None) -> list[str]:

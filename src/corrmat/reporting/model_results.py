@@ -11,6 +11,8 @@ import torch
 from corrmat.files import replace_text
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG
 
+LARGE = "coherence", "correlation"  # of large clouds, beside agreement and support
+
 
 @dataclass(frozen=True)
 class ModelResult:
@@ -35,8 +37,13 @@ class ModelResult:
 
     @property
     def scores(self) -> np.ndarray:
-        """Return what the confidence of each pair is computed from, (n, 2): agreement, support."""
-        return np.array([self.per_pair["agreement"], self.per_pair["support"]]).T
+        """Return what the confidence of each pair is computed from.
+
+        Returns:
+            (n, 2) agreement and support, or (n, 4) with `LARGE`.
+        """
+        names = ["agreement", "support", *(name for name in LARGE if name in self.per_pair)]
+        return np.array([self.per_pair[name] for name in names]).T
 
 
 @dataclass(frozen=True)

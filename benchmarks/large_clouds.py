@@ -1,0 +1,181 @@
+"""Dense scans of objects and of rooms: the shipped weights beside RANSAC and KISS-Matcher.
+
+    python benchmarks/large_clouds.py dense       half an hour; needs pip install -e '.[baselines]'
+    python benchmarks/large_clouds.py rooms
+
+FPFH + RANSAC (Open3D) and KISS-Matcher get the whole clouds on a voxel grid. Its size is chosen on
+other pairs. `phase` is the highest peak of phase correlation between the Manhattan frames, without
+any network. All are refined by the same generalised ICP, coarse to fine. The record is
+results/register/<protocol>-procedural-20000.json. `choice` in it says, on those other pairs, what
+the candidates of phase correlation and the weights of large clouds are worth
+(`registration/choice.py`; the weights were chosen on further ones).
+"""
+
+import argparse
+import functools
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+from rich.progress import track
+
+from corrmat.baselines import FpfhSettings, KissSettings, fpfh_ransac, kiss_matcher
+from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG
+from corrmat.registration import benchmark
+from corrmat.registration.choice import (
+    CHOICE_WEIGHTS,
+    LARGE_CLOUDS,
+    ChoiceWeights,
+    choose,
+    find_candidates,
+    measure,
+    refine_chosen,
+    refine_some,
+)
+from corrmat.registration.hypotheses import NetworkHypotheses
+from corrmat.registration.preparation import prepare_clouds, to_original_units
+from corrmat.registration.scoring import refine_coarse_to_fine, scorers_of_levels
+from corrmat.registration.verification import verify
+from corrmat.reporting.model_results import ModelResult, write_comparison
+from corrmat.revision import commit
+from corrmat.types import PairBatch
+from corrmat.weights import load_model
+
+RESULTS = Path(__file__).resolve().parents[1] / "results" / "register"
+POINTS, TEST_PAIRS, OTHER_PAIRS = 20_000, 60, 60
+VOXELS = {  # metres, or radii of an object
+    "rooms": {
+        "ransac": (0.08, 0.12, 0.18, 0.27, 0.4), "kiss": (0.035, 0.05, 0.07, 0.1, 0.15),
+    },
+    "dense": {
+        "ransac": (0.02, 0.03, 0.045, 0.07, 0.1), "kiss": (0.015, 0.02, 0.03, 0.045, 0.07),
+    },
+}  # fmt: skip
+WEIGHTS = {
+    "those of small clouds": CHOICE_WEIGHTS,
+    "without verification": LARGE_CLOUDS._replace(verification=0.0),
+    "without phase correlation": LARGE_CLOUDS._replace(correlation=0.0),
+    "without coherence": LARGE_CLOUDS._replace(coherence=0.0),
+    "in use": LARGE_CLOUDS,
+}
+
+
+def ransac(source: np.ndarray, target: np.ndarray, voxel: float) -> np.ndarray:
+    """Run RANSAC over FPFH features of voxelised clouds, with Open3D's customary ratios."""
+    clouds = []
+    for points in (source, target):
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+        cloud = cloud.voxel_down_sample(voxel)
+        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(2 * voxel, 30))
+        clouds.append(np.hstack([cloud.points, cloud.normals]))
+    settings = FpfhSettings(feature_radius=5 * voxel, inlier_threshold=1.5 * voxel)
+    return fpfh_ransac(*clouds, [0], settings)[0]
+
+
+def kiss(source: np.ndarray, target: np.ndarray, voxel: float) -> np.ndarray:
+    """Run KISS-Matcher with its defaults."""
+    return kiss_matcher(source, target, KissSettings(voxel), voxel_sampling=True)
+
+
+def phase(source: np.ndarray, target: np.ndarray, voxel: float) -> np.ndarray:
+    """Return the highest peak of phase correlation between the Manhattan frames alone."""
+    (x, y), scale, _, scorers = prepare_clouds(source, target, 0)
+    (peak,) = scorers[1].phase_correlation.peaks(np.empty((0, 3, 3)), 1)
+    return to_original_units(peak, scale, x.centre, y.centre)
+
+
+PIPELINES: dict[str, Callable[[np.ndarray, np.ndarray, float], np.ndarray]] = {
+    "ransac": ransac, "kiss": kiss, "phase": phase,
+}  # fmt: skip
+
+
+def run(pairs: PairBatch, name: str, voxel: float) -> ModelResult:
+    """Register all pairs with one pipeline, refined on all points."""
+    outcomes = []
+    for index in track(range(len(pairs)), f"{name}, {voxel}", transient=True):
+        source, target = (c[index].double().numpy() for c in (pairs.source, pairs.target))
+        start = time.perf_counter()
+        scorers = scorers_of_levels(source, target)
+        transform = refine_coarse_to_fine(PIPELINES[name](source, target, voxel), scorers)
+        ms = 1e3 * (time.perf_counter() - start)
+        angle, adds = benchmark.errors(pairs, index, transform)
+        outcomes.append(
+            benchmark.Outcome(angle, adds, ms, scorers[-1].alignment(transform).agreement, 1.0)
+        )
+    return benchmark.summarise(pairs, outcomes)
+
+
+def choices(pairs: PairBatch) -> dict[str, dict[str, float]]:
+    """Compute recall with the weights of `WEIGHTS`, and without candidates of phase correlation."""
+    generate = NetworkHypotheses(load_model())
+    rows = [
+        choices_of(pairs, index, generate)
+        for index in track(range(len(pairs)), "choice", transient=True)
+    ]
+    recalls = {}
+    for name in rows[0]:
+        angle, adds = np.array([row[name] for row in rows]).T
+        within, aligned = np.mean(angle < RECALL_DEG), np.mean(adds < ADDS_THRESHOLD)
+        recalls[name] = {"recall_5deg": float(within), "recall_adds": float(aligned)}
+    return recalls
+
+
+def choices_of(
+    pairs: PairBatch, index: int, generate: NetworkHypotheses
+) -> dict[str, tuple[float, float]]:
+    """Return the errors, degrees and ADD-S, of one pair for every choice."""
+    source, target = (c[index].double().numpy() for c in (pairs.source, pairs.target))
+    (x, y), scale, subsamples, scorers = prepare_clouds(source, target, 0)
+    hypotheses = generate(*subsamples, 0)
+    own = refine_some(hypotheses.transforms, hypotheses, scorers[0])
+    own_measures = measure(own, hypotheses, subsamples, scorers)
+    found, measures = find_candidates(hypotheses, subsamples, scorers)
+
+    def chosen(among: np.ndarray, measured: np.ndarray, weights: ChoiceWeights) -> np.ndarray:
+        best = choose(measured, weights, lambda some: verify(among[some], hypotheses, subsamples))
+        return among[best]
+
+    @functools.cache
+    def errors(transform: bytes) -> tuple[float, float]:
+        matrix = np.frombuffer(transform).reshape(4, 4)
+        final = refine_chosen(matrix, hypotheses, subsamples, scorers)
+        final = to_original_units(final, scale, x.centre, y.centre)
+        return benchmark.errors(pairs, index, final)
+
+    alone = "the network's candidates alone"
+    picked = {
+        f"those of small clouds, {alone}": chosen(own, own_measures, CHOICE_WEIGHTS),
+        f"in use, {alone}": chosen(own, own_measures, LARGE_CLOUDS),
+    }
+    picked |= {name: chosen(found, measures, weights) for name, weights in WEIGHTS.items()}
+    return {name: errors(transform.tobytes()) for name, transform in picked.items()}
+
+
+def main() -> None:
+    """Choose the voxels, then compare."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("protocol", choices=sorted(VOXELS))
+    protocol = parser.parse_args().protocol
+    code = commit()
+    others = benchmark.frozen_pairs(protocol, points=POINTS, count=OTHER_PAIRS, split="val")
+    tried = {
+        name: {voxel: run(others, name, voxel).recall_5deg for voxel in voxels}
+        for name, voxels in VOXELS[protocol].items()
+    }
+    print(tried)
+    pairs = benchmark.frozen_pairs(protocol, points=POINTS, count=TEST_PAIRS)
+    results = benchmark.compare(pairs, ["corrmat"])
+    for name, recalls in tried.items():
+        results[name] = run(pairs, name, max(recalls, key=recalls.__getitem__))
+    results["phase"] = run(pairs, "phase", 0.0)
+    print(benchmark.to_table(results))
+    about = {"protocol": protocol, "data": "procedural", "points": POINTS, "pairs": len(pairs)}
+    path = RESULTS / f"{protocol}-procedural-{POINTS}.json"
+    more = {"commit": code, "tuning": tried, "choice": choices(others)}
+    write_comparison(path, results, about | more)
+
+
+if __name__ == "__main__":
+    main()
