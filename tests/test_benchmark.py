@@ -129,6 +129,19 @@ def test_the_table_of_the_choice_has_a_row_for_all_weights(tmp_path):
     assert "in the mean: 11, 2.0 of them different (real)" in comparisons.choice_table(tmp_path)
 
 
+def test_the_choice_in_large_clouds_has_a_column_a_record(tmp_path):
+    assert comparisons.large_choice_table(tmp_path) == "No choice is recorded."
+    folder = tmp_path / "register"
+    folder.mkdir()
+    for protocol, share in (("dense", 0.5), ("rooms", 0.75)):
+        choice = {"in use": {"recall_5deg": share, "recall_adds": share / 2}}
+        record = {"protocol": protocol, "choice": choice}
+        (folder / f"{protocol}-procedural-20000.json").write_text(json.dumps(record))
+    rows = comparisons.large_choice_table(tmp_path).splitlines()
+    assert rows[0] == "| candidates and weights | dense | rooms |"
+    assert rows[2] == "| in use | 50%, 25% | 75%, 38% |"
+
+
 def test_fragments_of_a_room_overlap_in_part_and_lie_on_each_other():
     pair, again = (make_room_pair(3, 2000, "test") for _ in range(2))
     np.testing.assert_array_equal(pair.source, again.source)

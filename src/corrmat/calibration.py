@@ -9,7 +9,7 @@ import numpy as np
 from corrmat.weights import shipped_metadata
 
 # Least confidence of the verdicts "aligned" and "probably aligned". `make calibration` says how
-# many of the held-out pairs are called "aligned" wrongly: fewer than 1.5 % of them should be.
+# many of the held-out pairs are called "aligned" wrongly: about 2 % at most should be.
 SURE, LIKELY = 0.94, 0.5
 
 

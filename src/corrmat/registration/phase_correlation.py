@@ -64,7 +64,7 @@ class PhaseCorrelation:
         return rigid.to_homogeneous(rotations[turn], shifts @ self._target_frame)
 
     def at(self, transform: np.ndarray) -> float:
-        """Compute the highest correlation within a voxel of a transform (4, 4)."""
+        """Compute the highest correlation within a voxel of a transform (4, 4); at most 4."""
         heights = self._correlate(transform[:3, :3], transform[:3, 3])
         return float(heights[np.ix_(_NEXT, _NEXT, _NEXT)].max())
 

@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import NotRequired, TypedDict
+from typing import Any, NotRequired, TypedDict
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -149,6 +149,20 @@ def choice_table(results: Path) -> str:
     return "\n".join([*lines, "", f"{counts} pairs. Candidates a pair, in the mean: {means}."])
 
 
+def large_choice_table(results: Path) -> str:
+    """Build the table of what the choice among the candidates of large clouds is worth."""
+    paths = sorted((results / "register").glob("*-procedural-*.json"))
+    records = [record for record in map(_read_json, paths) if "choice" in record]
+    if not records:
+        return "No choice is recorded."
+    lines = markdown_head(["candidates and weights", *(record["protocol"] for record in records)])
+    for choice in records[0]["choice"]:
+        rows = [record["choice"][choice] for record in records]
+        shares = [f"{row['recall_5deg']:.0%}, {row['recall_adds']:.0%}" for row in rows]
+        lines.append(markdown_row([choice, *shares]))
+    return "\n".join(lines)
+
+
 def confidence_table(results: Path) -> str:
     """Build the table of verdicts: what their confidence promised, and what was so.
 
@@ -252,6 +266,10 @@ def draw_training(results: Path) -> None:
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.grid(alpha=0.3)
     save(figure, results / "register" / "training.png")
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    return json.loads(path.read_text())
 
 
 def _read_comparisons(results: Path) -> list[Comparison]:

@@ -27,6 +27,7 @@ from corrmat.reporting.comparisons import (
     doubling_summary,
     draw_training,
     families_table,
+    large_choice_table,
     networks_table,
 )
 from corrmat.reporting.intervals import Estimate, as_text
@@ -249,6 +250,7 @@ TABLES: tuple[tuple[str, str, Callable[[Results], str]], ...] = (
     ("docs/claims.md", "claims", lambda results: markdown_claims(results.claims)),
     ("docs/register.md", "comparison", lambda results: comparison_table(results.folder)),
     ("docs/register.md", "choice", lambda results: choice_table(results.folder)),
+    ("docs/register.md", "large-choice", lambda results: large_choice_table(results.folder)),
     ("docs/register.md", "networks", lambda results: networks_table(results.folder)),
     ("docs/register.md", "families", lambda results: families_table(results.folder)),
     ("docs/register.md", "doubling", lambda results: doubling_summary(results.folder)),
