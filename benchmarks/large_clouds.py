@@ -139,7 +139,7 @@ def choices_of(
 
     @functools.cache
     def errors(transform: bytes) -> tuple[float, float]:
-        matrix = np.frombuffer(transform).reshape(4, 4)
+        matrix = np.frombuffer(transform).reshape(4, 4).copy()
         final = refine_chosen(matrix, hypotheses, subsamples, scorers)
         final = to_original_units(final, scale, x.centre, y.centre)
         return benchmark.errors(pairs, index, final)

@@ -34,6 +34,8 @@ def package(tmp_path, monkeypatch):
     shutil.copy(weights.SHIPPED, copy)
     monkeypatch.setattr(weights, "SHIPPED", copy)
     monkeypatch.setattr(shipping, "CALIBRATION_PAIRS", {512: 3})
+    monkeypatch.setattr(shipping, "CALIBRATION_SCANS", 2)
+    monkeypatch.setattr(shipping, "SCAN_POINTS", 2100)
     monkeypatch.setattr("corrmat.data.shapes.dataset.SIZE", {"train": 200, "test": 10})
     monkeypatch.setattr("corrmat.data.shapes.dataset.ASSEMBLIES", {"train": 20, "test": 10})
     return copy
@@ -49,10 +51,11 @@ def test_a_checkpoint_becomes_the_weights_of_the_package(checkpoint, package, tm
     assert int(header["pairs"]) == before + 400
     (run,) = json.loads((tmp_path / "results" / "register" / "training.json").read_text())
     assert (run["before"], run["pairs"], run["curve"]) == (before, before + 400, [{"loss": 1.0}])
-    assert set(run["validation"]) == {"real", "views", "clean"}
+    assert set(run["validation"]) == {"real", "views", "clean", "dense", "rooms"}
     calibration = shipped_calibration()
-    assert (len(calibration.both), len(calibration.agreement)) == (3, 2)
+    assert [*map(len, (calibration.both, calibration.large, calibration.agreement))] == [3, 5, 2]
     assert 0 < calibration.confidence(0.5, 0.5) < 1
+    assert 0 < calibration.confidence(0.5, 0.5, (0.1, 0.3)) < 1
     trained, shipped = load_model(checkpoint).state_dict(), load_model().state_dict()
     assert trained.keys() == shipped.keys()
     assert all(torch.equal(trained[key], shipped[key]) for key in trained)

@@ -94,8 +94,7 @@ ASC, PTS, NPY, NPZ. Both files must have the same unit, whichever it is. Parts m
 from either.
 
 verdict: "aligned" from a confidence of 94 % on, "probably aligned" from 50 %, else "doubtful".
-It holds for single objects. In rooms a confident verdict is often wrong: look at --html, and
-compare with --model kiss.
+It was fitted on simulated pairs of objects and rooms: look at --html before you rely on it.
 exit codes: 0 done, whatever the verdict; 2 a file cannot be used, and one line says why."""
 
 Scale = Literal["smoke", "laptop", "overnight", "paper"]

@@ -39,7 +39,7 @@ class TrainingRun(TypedDict):
 
 def comparison_summary(results: Path) -> str:
     """Build README's table: recall at 5 degrees of every model, ours with its interval."""
-    records = [r for r in _read_comparisons(results) if r.protocol in _SMALL]
+    records = _read_comparisons(results)
     if not records:
         return "No comparison is recorded; `make protocols` makes them."
     models = list(records[0].models)
@@ -47,6 +47,9 @@ def comparison_summary(results: Path) -> str:
     for record in records:
         cells = []
         for model in models:
+            if model not in record.models:
+                cells.append("")
+                continue
             hits = record.models[model].within_angle
             interval = f" ({_wilson(hits)})" if model == OURS else ""
             cells.append(f"{hits.mean():.0%}{interval}")
