@@ -23,17 +23,8 @@ from rich.progress import track
 
 from corrmat.baselines import FpfhSettings, KissSettings, fpfh_ransac, kiss_matcher
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG
-from corrmat.registration import benchmark
-from corrmat.registration.choice import (
-    CHOICE_WEIGHTS,
-    LARGE_CLOUDS,
-    ChoiceWeights,
-    choose,
-    find_candidates,
-    measure,
-    refine_chosen,
-    refine_some,
-)
+from corrmat.registration import benchmark, choice
+from corrmat.registration.choice import CHOICE_WEIGHTS, LARGE_CLOUDS, ChoiceWeights
 from corrmat.registration.hypotheses import NetworkHypotheses
 from corrmat.registration.preparation import prepare_clouds, to_original_units
 from corrmat.registration.scoring import refine_coarse_to_fine, scorers_of_levels
@@ -129,18 +120,20 @@ def choices_of(
     source, target = (c[index].double().numpy() for c in (pairs.source, pairs.target))
     (x, y), scale, subsamples, scorers = prepare_clouds(source, target, 0)
     hypotheses = generate(*subsamples, 0)
-    own = refine_some(hypotheses.transforms, hypotheses, scorers[0])
-    own_measures = measure(own, hypotheses, subsamples, scorers)
-    found, measures = find_candidates(hypotheses, subsamples, scorers)
+    own = choice.refine_some(hypotheses.transforms, hypotheses, scorers[0])
+    own_measures = choice.measure(own, hypotheses, subsamples, scorers)
+    found, measures = choice.find_candidates(hypotheses, subsamples, scorers)
 
     def chosen(among: np.ndarray, measured: np.ndarray, weights: ChoiceWeights) -> np.ndarray:
-        best = choose(measured, weights, lambda some: verify(among[some], hypotheses, subsamples))
+        best = choice.choose(
+            measured, weights, lambda some: verify(among[some], hypotheses, subsamples)
+        )
         return among[best]
 
     @functools.cache
     def errors(transform: bytes) -> tuple[float, float]:
         matrix = np.frombuffer(transform).reshape(4, 4).copy()
-        final = refine_chosen(matrix, hypotheses, subsamples, scorers)
+        final = choice.refine_chosen(matrix, hypotheses, subsamples, scorers)
         final = to_original_units(final, scale, x.centre, y.centre)
         return benchmark.errors(pairs, index, final)
 
