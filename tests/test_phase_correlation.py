@@ -58,6 +58,16 @@ def test_the_highest_peak_is_the_transform(corner):
     assert correlation.at(truth) > 2 * correlation.at(peaks[1])
 
 
+def test_a_transform_is_shifted_to_the_highest_correlation_next_to_it(corner):
+    turn = Rotation.from_rotvec([0.4, -0.3, 1.1]).as_matrix()
+    truth = rigid.to_homogeneous(turn, np.array([0.33, -0.21, 0.4]))
+    correlation = PhaseCorrelation(corner, moved(corner, truth))
+    off = truth.copy()
+    off[:3, 3] += turn @ [0.1, 0.0, -0.1]  # along the walls, a voxel
+    np.testing.assert_allclose(correlation.shifted(off), truth, atol=1e-6)
+    np.testing.assert_array_equal(correlation.shifted(truth), truth)
+
+
 def test_a_given_rotation_is_searched_too(corner):
     """Where frames do not help: a cloud without right angles."""
     rng = np.random.default_rng(0)

@@ -199,8 +199,10 @@ def refine_chosen(
 
     With matches, the last iterations are enough for the second pass. Generalised ICP follows where
     it is more exact: on points that the model has not seen, and on points that both clouds share.
-    In large clouds the model's points are too few: EM-ICP slides along the walls of a room. There
-    generalised ICP starts from the chosen transform, too, and what agrees better is taken.
+    In large clouds the model's points are too few, and a candidate slides along the walls of a
+    room: there it is shifted to the nearest peak of the phase correlation, and generalised ICP on
+    more and more points follows. Without phase correlation, generalised ICP starts from the chosen
+    transform and from EM-ICP's, and what agrees better is taken.
 
     Args:
         transform: of the source onto the target.
@@ -208,6 +210,9 @@ def refine_chosen(
         subsamples: the clouds that they were made from.
         scorers: of the clouds, of more and more of their points.
     """
+    correlation = phase_correlation(hypotheses, scorers)
+    if correlation:
+        return refine_coarse_to_fine(correlation.shifted(transform), scorers)
     chosen = transform
     source, target = (cloud[:COARSE_POINTS] for cloud in subsamples)
     prob = hypotheses.prob

@@ -65,8 +65,19 @@ class PhaseCorrelation:
 
     def at(self, transform: np.ndarray) -> float:
         """Compute the highest correlation within a voxel of a transform (4, 4); at most 4."""
+        return float(self._around(transform).max())
+
+    def shifted(self, transform: np.ndarray) -> np.ndarray:
+        """Shift a transform (4, 4) to the highest correlation within a voxel of it."""
+        heights = self._around(transform)
+        cell = np.unravel_index(heights.argmax(), heights.shape)
+        shift = _VOXEL * np.array(_NEXT)[np.array(cell)] @ self._target_frame
+        return rigid.to_homogeneous(transform[:3, :3], transform[:3, 3] + shift)
+
+    def _around(self, transform: np.ndarray) -> np.ndarray:
+        """Correlate at a transform (4, 4) and at the shifts next to it: (3, 3, 3)."""
         heights = self._correlate(transform[:3, :3], transform[:3, 3])
-        return float(heights[np.ix_(_NEXT, _NEXT, _NEXT)].max())
+        return heights[np.ix_(_NEXT, _NEXT, _NEXT)]
 
     def _correlate(self, rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
         """Correlate the moved source with the target, (size, size, size): one for each shift."""
