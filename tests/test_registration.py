@@ -39,6 +39,7 @@ from corrmat.registration.hypotheses import (
     rough_agreement,
     unmatched_nll,
 )
+from corrmat.registration.phase_correlation import PhaseCorrelation
 from corrmat.registration.scene import build_scene, extent
 from corrmat.registration.scoring import COARSE_POINTS, AlignmentScorer
 from corrmat.registration.verification import verify
@@ -809,16 +810,25 @@ def test_the_choice_is_by_agreement_coherence_unmatched_loss_and_support(pair):
     assert not verify(transforms, hypotheses._replace(verification=None), subsamples).any()
 
 
+def moved_m(room):
+    """Register two fragments of a room: how far the source lies from its true place, in metres."""
+    truth = rigid.to_homogeneous(room.rotation, room.translation)
+    off = corrmat.register(room.source, room.target).transform - truth
+    return np.linalg.norm(room.source @ off[:3, :3].T + off[:3, 3], axis=1).mean()
+
+
 def test_a_room_whose_matches_are_wrong_is_registered_by_phase_correlation(monkeypatch):
     """Without it, this fragment comes out metres away."""
     room = make_room_pair(208, 20_000, "val")
-    truth = rigid.to_homogeneous(room.rotation, room.translation)
-
-    def moved_m():
-        off = corrmat.register(room.source, room.target).transform - truth
-        return np.linalg.norm(room.source @ off[:3, :3].T + off[:3, 3], axis=1).mean()
-
-    assert moved_m() < 0.02
+    assert moved_m(room) < 0.02
     for module in (choice, sys.modules["corrmat.registration.register"]):
         monkeypatch.setattr(module, "phase_correlation", lambda hypotheses, scorers: None)
-    assert moved_m() > 1
+    assert moved_m(room) > 1
+
+
+def test_the_chosen_candidate_of_a_room_is_shifted_before_it_is_refined(monkeypatch):
+    """As it is, generalised ICP takes it along a wall."""
+    room = make_room_pair(418, 20_000, "val")
+    assert moved_m(room) < 0.02
+    monkeypatch.setattr(PhaseCorrelation, "shifted", lambda self, transform: transform)
+    assert moved_m(room) > 0.1
