@@ -89,7 +89,6 @@ def test_a_far_stray_point_does_not_make_the_grid_large(corner):
 
 
 def test_the_right_shift_of_a_room_is_among_the_peaks():
-    """And no candidate of the network: its walls look all alike."""
     room = make_room_pair(218, 20_000, "val")
     (x, y), scale, _, scorers = prepare_clouds(room.source, room.target, 0)
     truth = rigid.to_homogeneous(room.rotation, room.translation)

@@ -39,7 +39,7 @@ class PhaseCorrelation:
         radii = sum(np.linalg.norm(cloud[:, :3], axis=1).max() for cloud in (source, target))
         voxels = min(2 * _FARTHEST * radii / _VOXEL, _MOST_VOXELS)
         self._size = 4 * int(np.ceil(voxels / 4))  # of small factors, for the Fourier transform
-        self._target = self._phases(target, self._target_frame)
+        self._target = self._phases(target)
 
     def peaks(self, rotations: np.ndarray, count: int) -> np.ndarray:
         """Search all shifts, of given rotations and of the 24 between the two Manhattan frames.
@@ -83,23 +83,22 @@ class PhaseCorrelation:
         """Correlate the moved source with the target, (size, size, size): one for each shift."""
         points, normals = np.hsplit(self._source, 2)
         moved = np.hstack([points @ rotation.T + translation, normals @ rotation.T])
-        source = self._phases(moved, self._target_frame)
+        source = self._phases(moved)
         product = (source.conj() * self._target).sum(0)
         return np.fft.irfftn(product, [self._size] * 3, axes=(0, 1, 2))
 
-    def _phases(self, cloud: np.ndarray, frame: np.ndarray) -> np.ndarray:
+    def _phases(self, cloud: np.ndarray) -> np.ndarray:
         """Compute spectra of magnitude one of four grids: surfaces along each axis, and others.
 
         Args:
             cloud: (N, 6).
-            frame: (3, 3) whose rows are the axes of the grid.
 
         Returns:
             (4, size, size, size // 2 + 1) complex.
         """
-        along = np.abs(cloud[:, 3:] @ frame.T)
+        along = np.abs(cloud[:, 3:] @ self._target_frame.T)
         kind = np.where(along.max(1) > _PARALLEL, along.argmax(1), 3)
-        voxels = np.round(cloud[:, :3] @ frame.T / _VOXEL).astype(int) % self._size
+        voxels = np.round(cloud[:, :3] @ self._target_frame.T / _VOXEL).astype(int) % self._size
         grid = np.zeros((4, *[self._size] * 3), np.float32)
         grid[kind, *voxels.T] = 1
         spectrum = np.fft.rfftn(grid, axes=(1, 2, 3))
