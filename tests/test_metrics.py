@@ -38,6 +38,7 @@ def test_a_perfect_prediction_has_the_perfect_score(batch):
     assert math.isnan(values.pop("transposed_match_accuracy"))  # asks for clouds of one size
     assert math.isnan(values.pop("outlier_precision"))  # no such class
     assert math.isnan(values.pop("outlier_recall"))
+    assert math.isnan(values.pop("outlier_r_precision"))
     assert all(value == pytest.approx(0, abs=1e-5) for value in values.values()), values
 
 

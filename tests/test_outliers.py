@@ -155,7 +155,14 @@ def test_perfect_weights_give_the_perfect_pose():
     scores.update(prediction, batch)
     values = scores.compute()
     assert values["match_accuracy"] == values["outlier_precision"] == values["outlier_recall"] == 1
+    assert values["outlier_r_precision"] == 1
     assert values["rotation_error_deg_mean"] < 1e-3
+
+
+def test_r_precision_ranks_the_points_by_their_weight():
+    weight = torch.tensor([[0.9, 0.1, 0.4, 0.2, 0.3], [0.5, 0.4, 0.3, 0.2, 0.1]])
+    match = torch.tensor([[0, 5, 5, 1, -1], [0, 1, 2, 3, 4]])  # two outliers, and none
+    assert metrics.outliers_ranked(weight, match, 5).tolist() == [1, 0]  # of the two lowest, one
 
 
 def test_precision_and_recall_of_the_outlier_class():

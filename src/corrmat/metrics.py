@@ -129,6 +129,25 @@ def outlier_counts(predicted: Tensor, match: Tensor, num_target: int) -> tuple[T
     return (positive & true).sum(1), positive.sum(1), true.sum(1)
 
 
+def outliers_ranked(weight: Tensor, match: Tensor, num_target: int) -> Tensor:
+    """Count the true outliers among as many points of the lowest weight.
+
+    Their share of the true outliers is the precision and the recall of the threshold at which the
+    two are equal (R-precision). It compares matrices whose arg max trades one for the other.
+
+    Args:
+        weight: (B, N) probability of not being an outlier.
+        match: (B, N) int64, num_target where a point is an outlier.
+        num_target: M.
+
+    Returns:
+        (B,) int64.
+    """
+    true = match == num_target
+    rank = weight.argsort(1).argsort(1)
+    return (true & (rank < true.sum(1, keepdim=True))).sum(1)
+
+
 def chamfer(prediction: Prediction, batch: PairBatch) -> Tensor:
     """Compute RPMNet's modified Chamfer distance, with squared distances (RPM-Net, section 5.3).
 
@@ -154,7 +173,7 @@ class RegistrationMetrics(Metric):
     """
 
     full_state_update = False
-    _OUTLIERS = ("outliers_correct", "outliers_predicted", "outliers_true")
+    _OUTLIERS = "outliers_correct", "outliers_predicted", "outliers_true", "outliers_ranked"
     _STATE = (
         "shape", "predicted", "truth", "num_correct", "num_correct_transposed", "num_matchable",
         "chamfer_distance", *_OUTLIERS,
@@ -171,14 +190,16 @@ class RegistrationMetrics(Metric):
         missing = torch.full(
             (len(batch),), torch.nan, dtype=torch.float64, device=batch.source.device
         )
-        correct, transposed, outliers = missing, missing, [missing] * 3
+        correct, transposed, outliers = missing, missing, [missing] * len(self._OUTLIERS)
         if c is not None:
             predicted = c.argmax()
             correct = num_correct(predicted, batch.match, m).double()
             if n == m and is_match(batch.match, m).all():
                 transposed = num_correct_transposed(predicted, batch.match).double()
             if c.outlier is not None:
-                outliers = [x.double() for x in outlier_counts(predicted, batch.match, m)]
+                ranked = outliers_ranked(c.weight(), batch.match, m)
+                counts = *outlier_counts(predicted, batch.match, m), ranked
+                outliers = [x.double() for x in counts]
         values = {
             "shape": batch.shape,
             "predicted": _flatten(prediction.rotation, prediction.translation),
@@ -240,6 +261,7 @@ def summary(per_pair: dict[str, Tensor]) -> dict[str, float]:
         "transposed_match_accuracy": _ratio(per_pair, "num_correct_transposed", "num_matchable"),
         "outlier_precision": _ratio(per_pair, "outliers_correct", "outliers_predicted"),
         "outlier_recall": _ratio(per_pair, "outliers_correct", "outliers_true"),
+        "outlier_r_precision": _ratio(per_pair, "outliers_ranked", "outliers_true"),
         "chamfer": per_pair["chamfer"].mean(),
         "recall@5deg_0.05": recalled.double().mean(),
         "failed": (~angle.isfinite()).double().sum(),

@@ -13,6 +13,7 @@ METRICS: dict[str, tuple[str, str, float]] = {
     "translation_rmse": ("translation RMSE", ".2g", 1),
     "outlier_precision": ("outlier class, precision, %", ".1f", 100),
     "outlier_recall": ("outlier class, recall, %", ".1f", 100),
+    "outlier_r_precision": ("outlier class, precision = recall (R-precision), %", ".1f", 100),
     "recall@5deg_0.05": ("pairs under 5 deg and 0.05, %", ".1f", 100),
     "chamfer": ("Chamfer distance (squared)", ".2g", 1),
     "failed": ("pairs without an answer", ".0f", 1),
@@ -24,7 +25,7 @@ METRICS: dict[str, tuple[str, str, float]] = {
 BAND_METRICS = ("relative_euler_mae_deg", "match_accuracy", "chamfer")
 SWEEP_METRICS = (
     "match_accuracy", "rotation_error_deg_median", "relative_euler_rmse_deg",
-    "outlier_precision", "outlier_recall",
+    "outlier_precision", "outlier_recall", "outlier_r_precision",
 )  # fmt: skip
 # Numbers that the paper cannot mean, as (experiment, arm, subset, metric): in table 2 this Chamfer
 # distance is a fifth of its neighbours'.
