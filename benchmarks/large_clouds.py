@@ -1,7 +1,7 @@
 """Dense scans of objects and of rooms: the shipped weights beside RANSAC and KISS-Matcher.
 
     python benchmarks/large_clouds.py dense       half an hour; needs pip install -e '.[baselines]'
-    python benchmarks/large_clouds.py rooms
+    python benchmarks/large_clouds.py rooms       a little longer
 
 FPFH + RANSAC (Open3D) and KISS-Matcher get the whole clouds on a voxel grid. Its size is chosen on
 other pairs. `phase` is the highest peak of phase correlation between the Manhattan frames, without
@@ -14,7 +14,7 @@ the candidates of phase correlation and the weights of large clouds are worth
 import argparse
 import functools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +27,11 @@ from corrmat.registration import benchmark, choice
 from corrmat.registration.choice import CHOICE_WEIGHTS, LARGE_CLOUDS, ChoiceWeights
 from corrmat.registration.hypotheses import NetworkHypotheses
 from corrmat.registration.preparation import prepare_clouds, to_original_units
-from corrmat.registration.scoring import refine_coarse_to_fine, scorers_of_levels
+from corrmat.registration.scoring import (
+    AlignmentScorer,
+    refine_coarse_to_fine,
+    scorers_of_levels,
+)
 from corrmat.registration.verification import verify
 from corrmat.reporting.model_results import ModelResult, write_comparison
 from corrmat.revision import commit
@@ -35,7 +39,7 @@ from corrmat.types import PairBatch
 from corrmat.weights import load_model
 
 RESULTS = Path(__file__).resolve().parents[1] / "results" / "register"
-POINTS, TEST_PAIRS, OTHER_PAIRS = 20_000, 60, 60
+POINTS, TEST_PAIRS, OTHER_PAIRS = 20_000, 240, 60
 VOXELS = {  # metres, or radii of an object
     "rooms": {
         "ransac": (0.08, 0.12, 0.18, 0.27, 0.4), "kiss": (0.035, 0.05, 0.07, 0.1, 0.15),
@@ -53,7 +57,13 @@ WEIGHTS = {
 }
 
 
-def ransac(source: np.ndarray, target: np.ndarray, voxel: float) -> np.ndarray:
+def refined(transform: np.ndarray, scorers: Sequence[AlignmentScorer]) -> tuple[np.ndarray, float]:
+    """Refine a transform on all points; return it and its agreement."""
+    transform = refine_coarse_to_fine(transform, scorers)
+    return transform, scorers[-1].alignment(transform).agreement
+
+
+def ransac(source: np.ndarray, target: np.ndarray, voxel: float) -> tuple[np.ndarray, float]:
     """Run RANSAC over FPFH features of voxelised clouds, with Open3D's customary ratios."""
     clouds = []
     for points in (source, target):
@@ -62,22 +72,25 @@ def ransac(source: np.ndarray, target: np.ndarray, voxel: float) -> np.ndarray:
         cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(2 * voxel, 30))
         clouds.append(np.hstack([cloud.points, cloud.normals]))
     settings = FpfhSettings(feature_radius=5 * voxel, inlier_threshold=1.5 * voxel)
-    return fpfh_ransac(*clouds, [0], settings)[0]
+    transform = fpfh_ransac(*clouds, [0], settings)[0]
+    return refined(transform, scorers_of_levels(source, target))
 
 
-def kiss(source: np.ndarray, target: np.ndarray, voxel: float) -> np.ndarray:
+def kiss(source: np.ndarray, target: np.ndarray, voxel: float) -> tuple[np.ndarray, float]:
     """Run KISS-Matcher with its defaults."""
-    return kiss_matcher(source, target, KissSettings(voxel), voxel_sampling=True)
+    transform = kiss_matcher(source, target, KissSettings(voxel), voxel_sampling=True)
+    return refined(transform, scorers_of_levels(source, target))
 
 
-def phase(source: np.ndarray, target: np.ndarray, voxel: float) -> np.ndarray:
-    """Return the highest peak of phase correlation between the Manhattan frames alone."""
+def phase(source: np.ndarray, target: np.ndarray, voxel: float) -> tuple[np.ndarray, float]:
+    """Run phase correlation between the Manhattan frames alone, on a grid of its own."""
     (x, y), scale, _, scorers = prepare_clouds(source, target, 0)
     (peak,) = scorers[1].phase_correlation.peaks(np.empty((0, 3, 3)), 1)
-    return to_original_units(peak, scale, x.centre, y.centre)
+    transform, agreement = refined(peak, scorers)
+    return to_original_units(transform, scale, x.centre, y.centre), agreement
 
 
-PIPELINES: dict[str, Callable[[np.ndarray, np.ndarray, float], np.ndarray]] = {
+PIPELINES: dict[str, Callable[[np.ndarray, np.ndarray, float], tuple[np.ndarray, float]]] = {
     "ransac": ransac, "kiss": kiss, "phase": phase,
 }  # fmt: skip
 
@@ -88,13 +101,10 @@ def run(pairs: PairBatch, name: str, voxel: float) -> ModelResult:
     for index in track(range(len(pairs)), f"{name}, {voxel}", transient=True):
         source, target = (c[index].double().numpy() for c in (pairs.source, pairs.target))
         start = time.perf_counter()
-        scorers = scorers_of_levels(source, target)
-        transform = refine_coarse_to_fine(PIPELINES[name](source, target, voxel), scorers)
+        transform, agreement = PIPELINES[name](source, target, voxel)
         ms = 1e3 * (time.perf_counter() - start)
         angle, adds = benchmark.errors(pairs, index, transform)
-        outcomes.append(
-            benchmark.Outcome(angle, adds, ms, scorers[-1].alignment(transform).agreement, 1.0)
-        )
+        outcomes.append(benchmark.Outcome(angle, adds, ms, agreement, 1.0))
     return benchmark.summarise(pairs, outcomes)
 
 
