@@ -41,7 +41,7 @@ def to_text(registration: Registration) -> str:
         f"rotation     {registration.rotation_deg:.3f} deg",
         f"translation  {x:.6g} {y:.6g} {z:.6g}",
         f"overlap      {registration.overlap:.1%} of the source has a target point near",
-        f"RMSE         {registration.rmse:.6g} of those" if registration.overlap else "",
+        f"RMSE         {registration.rmse:.6g} of these points" if registration.overlap else "",
     ]
     if len(registration.matches):
         agree, matches = registration.match_agrees.sum(), len(registration.matches)
