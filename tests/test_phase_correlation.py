@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import maximum_filter
 from scipy.spatial.transform import Rotation
 
 from corrmat.data.scan_pairs import make_room_pair
 from corrmat.ops import rigid
-from corrmat.registration.phase_correlation import PhaseCorrelation, manhattan_frame
+from corrmat.registration.phase_correlation import PhaseCorrelation, highest_peaks, manhattan_frame
 from corrmat.registration.preparation import from_original_units, prepare_clouds
 
 
@@ -42,6 +43,19 @@ def test_a_manhattan_frame_has_the_walls_normals_as_axes(corner):
     np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-9)
     assert np.linalg.det(frame) == pytest.approx(1)
     np.testing.assert_allclose(np.sort(np.abs(frame @ turn), axis=1)[:, 2], 1, atol=1e-9)
+
+
+@pytest.mark.parametrize("count", [1, 5, 8])
+def test_the_highest_peaks_are_those_of_a_maximum_filter(count):
+    """In grids that wrap around; several peaks may lie in one grid, and neighbours may be equal."""
+    heights = np.random.default_rng(0).normal(size=(8, 6, 6, 6)).round(1)
+    heights[3, 0, 0, 0] = heights[3, -1, 2, 5] = heights.max() + 1
+    peaks = np.flatnonzero(heights == maximum_filter(heights, (1, 3, 3, 3), mode="wrap"))
+    peaks = peaks[np.argsort(-heights.ravel()[peaks], kind="stable")[:count]]
+    grids, *cells = np.unravel_index(peaks, heights.shape)
+    found = highest_peaks(heights, count)
+    np.testing.assert_array_equal(found[0], grids)
+    np.testing.assert_array_equal(found[1], np.stack(cells, 1))
 
 
 def test_the_highest_peak_is_the_transform(corner):

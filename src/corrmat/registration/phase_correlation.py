@@ -6,8 +6,10 @@ angles, wrong turns and shifts put walls on walls as well. Phase correlation (Ku
 furniture count, and not the number of points that a wall has.
 """
 
+import itertools
+
 import numpy as np
-from scipy.ndimage import maximum_filter
+import scipy.fft
 from scipy.spatial.transform import Rotation
 
 from corrmat.ops import rigid
@@ -46,21 +48,19 @@ class PhaseCorrelation:
 
         Args:
             rotations: (R, 3, 3) of source onto target.
-            count: of transforms.
+            count: of transforms, at most R + 24.
 
         Returns:
-            (T, 4, 4) transforms of source onto target, at most `count`, the highest correlation
-            first; exact to half a voxel.
+            (count, 4, 4) transforms of source onto target, the highest correlation first; exact
+            to half a voxel.
         """
         turns = Rotation.create_group("O").as_matrix()
         between_frames = self._target_frame.T @ turns @ self._source_frame
         rotations = np.concatenate([between_frames, rotations])
         heights = np.stack([self._correlate(rotation, np.zeros(3)) for rotation in rotations])
-        peaks = np.flatnonzero(heights == maximum_filter(heights, (1, 3, 3, 3), mode="wrap"))
-        peaks = peaks[np.argsort(-heights.ravel()[peaks], kind="stable")[:count]]
-        turn, *cells = np.unravel_index(peaks, heights.shape)
+        turn, cells = highest_peaks(heights, count)
         half = self._size // 2
-        shifts = _VOXEL * ((np.stack(cells, 1) + half) % self._size - half)
+        shifts = _VOXEL * ((cells + half) % self._size - half)
         return rigid.to_homogeneous(rotations[turn], shifts @ self._target_frame)
 
     def at(self, transform: np.ndarray) -> float:
@@ -85,7 +85,7 @@ class PhaseCorrelation:
         moved = np.hstack([points @ rotation.T + translation, normals @ rotation.T])
         source = self._phases(moved)
         product = (source.conj() * self._target).sum(0)
-        return np.fft.irfftn(product, [self._size] * 3, axes=(0, 1, 2))
+        return scipy.fft.irfftn(product, [self._size] * 3, axes=(0, 1, 2))
 
     def _phases(self, cloud: np.ndarray) -> np.ndarray:
         """Compute spectra of magnitude one of four grids: surfaces along each axis, and others.
@@ -101,9 +101,32 @@ class PhaseCorrelation:
         voxels = np.round(cloud[:, :3] @ self._target_frame.T / _VOXEL).astype(int) % self._size
         grid = np.zeros((4, *[self._size] * 3), np.float32)
         grid[kind, *voxels.T] = 1
-        spectrum = np.fft.rfftn(grid, axes=(1, 2, 3))
+        spectrum = scipy.fft.rfftn(grid, axes=(1, 2, 3))
         magnitude = np.abs(spectrum)
         return spectrum / (magnitude + _FLOOR * magnitude.max())
+
+
+def highest_peaks(heights: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Find the highest local maxima of several grids that wrap around.
+
+    Args:
+        heights: (G, n, n, n).
+        count: of maxima, at most G.
+
+    Returns:
+        (count,) grids and (count, 3) cells, the highest first.
+    """
+    # Each grid's highest cell is a local maximum, so that lower ones than `count` of them are out.
+    least = np.sort(heights.max((1, 2, 3)))[-count]
+    grid, *cell = np.nonzero(heights >= least)
+    peak = heights[grid, *cell]
+    is_highest = np.ones(len(grid), bool)
+    for step in itertools.product(_NEXT, repeat=3):
+        beside = [(c + s) % heights.shape[1] for c, s in zip(cell, step, strict=True)]
+        is_highest &= peak >= heights[grid, *beside]
+    highest = np.flatnonzero(is_highest)
+    highest = highest[np.argsort(-peak[highest], kind="stable")[:count]]
+    return grid[highest], np.stack(cell, 1)[highest]
 
 
 def manhattan_frame(normals: np.ndarray) -> np.ndarray:
@@ -117,7 +140,8 @@ def manhattan_frame(normals: np.ndarray) -> np.ndarray:
     """
     axes = Rotation.random(_STARTS, rng=np.random.default_rng(0)).as_matrix()
     for _ in range(_STEPS):
-        u, _, v = np.linalg.svd(((normals @ axes.mT) ** 3).mT @ normals)
+        along = normals @ axes.mT
+        u, _, v = np.linalg.svd((along * along * along).mT @ normals)
         axes = u @ v
     best = axes[((normals @ axes.mT) ** 4).sum((1, 2)).argmax()]
     return best * np.sign(np.linalg.det(best))
