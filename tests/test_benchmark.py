@@ -45,7 +45,8 @@ def test_who_knows_the_truth_scores_everything_and_who_does_not_nothing(pairs, m
             transform[:3, :3] = transform[:3, :3] @ np.diag([1.0, -1, -1])
         result = type("Result", (), {})()
         result.transform, result.seconds = transform, 0.01
-        result.agreement, result.support, result.large = 1.0, 1.0, ()
+        result.agreement, result.support = 1.0, 1.0
+        result.coherence = result.correlation = None
         return result
 
     monkeypatch.setattr(benchmark, "register", answer)
@@ -55,6 +56,16 @@ def test_who_knows_the_truth_scores_everything_and_who_does_not_nothing(pairs, m
     assert rows["wrong"].recall_5deg == rows["wrong"].recall_adds == 0
     assert rows["wrong"].mean_deg == pytest.approx(180, abs=0.1)
     assert rows["right"].ms == pytest.approx(10)
+
+
+def test_pairs_of_large_and_of_small_clouds_make_one_record():
+    few = benchmark.frozen_pairs("clean", points=256, count=2)
+    outcomes = [benchmark.Outcome(1, 0, 5, 0.9, 0.8), benchmark.Outcome(2, 0, 5, 0.9, 0.8, 0.1, 2)]
+    result = benchmark.summarise(few, outcomes)
+    assert result.scores == [(0.9, 0.8, None, None), (0.9, 0.8, 0.1, 2)]
+    small, large = benchmark.summarise(few, outcomes[:1] * 2), benchmark.Outcome(2, 0, 5, 0.9, 0.8)
+    assert "coherence" not in small.per_pair
+    assert small.scores[0] == tuple(large[3:])
 
 
 def test_the_command_prints_one_table_and_writes_a_record(pairs, tmp_path, capsys):

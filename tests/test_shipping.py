@@ -35,7 +35,7 @@ def package(tmp_path, monkeypatch):
     monkeypatch.setattr(weights, "SHIPPED", copy)
     monkeypatch.setattr(shipping, "CALIBRATION_PAIRS", {512: 3})
     monkeypatch.setattr(shipping, "CALIBRATION_SCANS", 2)
-    monkeypatch.setattr(shipping, "SCAN_POINTS", 2100)
+    monkeypatch.setattr(shipping, "SCAN_POINTS", 6000)
     monkeypatch.setattr("corrmat.data.shapes.dataset.SIZE", {"train": 200, "test": 10})
     monkeypatch.setattr("corrmat.data.shapes.dataset.ASSEMBLIES", {"train": 20, "test": 10})
     return copy

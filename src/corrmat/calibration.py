@@ -1,7 +1,6 @@
 """From the scores of a registration to a confidence, and from a confidence to words."""
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,20 +33,26 @@ class Calibration:
     agreement: list[float]
 
     def confidence(
-        self, agreement: float, support: float | None, large: Sequence[float] = ()
+        self,
+        agreement: float,
+        support: float | None,
+        coherence: float | None = None,
+        correlation: float | None = None,
     ) -> float:
         """Compute the chance that a registration is right.
 
         Args:
             agreement: of the two clouds, in [0, 1].
             support: of the matches, in [0, 1]; None for a model without matches.
-            large: coherence and phase correlation of large clouds.
+            coherence: of two large clouds; None for others.
+            correlation: their phase correlation; None for others.
         """
         if support is None:
             logit = np.dot(self.agreement, [agreement, 1.0])
+        elif coherence is None or correlation is None:
+            logit = np.dot(self.both, [agreement, support, 1.0])
         else:
-            coefficients = self.large if large else self.both
-            logit = np.dot(coefficients, [agreement, support, *large, 1.0])
+            logit = np.dot(self.large, [agreement, support, coherence, correlation, 1.0])
         return float(1 / (1 + np.exp(-logit)))
 
 

@@ -17,7 +17,7 @@ from corrmat.data.scan_pairs import ScanPair, make_object_pair, make_room_pair
 from corrmat.errors import CorrmatError
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG, rotation_error_deg
 from corrmat.registration.register import register
-from corrmat.reporting.model_results import LARGE, ModelResult
+from corrmat.reporting.model_results import SCORES, ModelResult
 from corrmat.types import PairBatch
 
 Protocol = Literal["paper", "real", "views", "clean", "dense", "rooms"]
@@ -60,7 +60,8 @@ class Outcome(NamedTuple):
     ms: float
     agreement: float
     support: float
-    large: tuple[float, ...] = ()  # see `Registration`
+    coherence: float | None = None
+    correlation: float | None = None
 
 
 def frozen_pairs(
@@ -148,7 +149,8 @@ def compare(pairs: PairBatch, models: Sequence[str]) -> dict[str, ModelResult]:
 
 def summarise(pairs: PairBatch, outcomes: Sequence[Outcome]) -> ModelResult:
     """Compute a model's result from its outcome on every pair."""
-    angle, adds, ms, agreement, support, large = map(np.array, zip(*outcomes, strict=True))
+    angle, adds, ms = map(np.array, zip(*(outcome[:3] for outcome in outcomes), strict=True))
+    scores = {name: [getattr(outcome, name) for outcome in outcomes] for name in SCORES}
     return ModelResult(
         mean_deg=float(angle.mean()),
         median_deg=float(np.median(angle)),
@@ -159,9 +161,11 @@ def summarise(pairs: PairBatch, outcomes: Sequence[Outcome]) -> ModelResult:
             "shape": pairs.shape.tolist(),
             "rotation_error_deg": np.round(angle, 4).tolist(),
             "adds": np.round(adds, 5).tolist(),
-            "agreement": np.round(agreement, 4).tolist(),
-            "support": np.round(support, 4).tolist(),
-            **dict(zip(LARGE, np.round(large, 4).T.tolist(), strict=bool(large.size))),
+            **{
+                name: [None if value is None else round(value, 4) for value in values]
+                for name, values in scores.items()
+                if any(value is not None for value in values)
+            },
         },
     )
 
@@ -184,9 +188,8 @@ def _register_pair(pairs: PairBatch, index: int, model: str) -> Outcome:
     source, target = (c[index].double().numpy() for c in (pairs.source, pairs.target))
     result = register(source, target, model=model)
     angle, adds = errors(pairs, index, result.transform)
-    return Outcome(
-        angle, adds, 1e3 * result.seconds, result.agreement, result.support, result.large
-    )
+    scores = (getattr(result, name) for name in SCORES)
+    return Outcome(angle, adds, 1e3 * result.seconds, *scores)
 
 
 def errors(pairs: PairBatch, index: int, transform: np.ndarray) -> tuple[float, float]:

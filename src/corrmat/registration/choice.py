@@ -12,6 +12,7 @@ from corrmat.registration.phase_correlation import PhaseCorrelation
 from corrmat.registration.preparation import MODEL_POINTS
 from corrmat.registration.scoring import (
     COARSE_POINTS,
+    LEVELS,
     AlignmentScorer,
     refine_coarse_to_fine,
 )
@@ -29,7 +30,7 @@ class ChoiceWeights(NamedTuple):
 
 CHOICE_WEIGHTS = ChoiceWeights(4.0, -1.0, 0.2, 0.0, 0.05)  # benchmarks/choice.py
 LARGE_CLOUDS = ChoiceWeights(8.0, 0.0, 0.0, 5.0, 0.05)  # benchmarks/large_clouds.py
-WITHOUT_MATCHABILITIES = ChoiceWeights(1.5, 0.0, 0.0, 0.0, 0.0)  # for models that have none
+WITHOUT_MATCHABILITIES = ChoiceWeights(1.5, 0.0, 0.0, 0.0, 0.0)  # for other models
 PEAKS = 16  # candidates from phase correlation
 HALF_TURNED = 3  # candidates at most
 VERIFIED = 8  # candidates at most
@@ -50,18 +51,30 @@ def distinct(transforms: np.ndarray) -> np.ndarray:
 def phase_correlation(
     hypotheses: Hypotheses, scorers: Sequence[AlignmentScorer]
 ) -> PhaseCorrelation | None:
-    """Return the phase correlation of large clouds, for models with matches; None for all others.
+    """Return the phase correlation of two clouds, for models with matches; else None.
 
-    Its grid is too fine for the few points of a small cloud.
+    Its grid is too fine for two small clouds: there it is None as well.
     """
     if hypotheses.prob is None or len(scorers) == 1:
         return None
     return scorers[1].phase_correlation
 
 
+def correlation_of_large(
+    hypotheses: Hypotheses, scorers: Sequence[AlignmentScorer]
+) -> PhaseCorrelation | None:
+    """Return the phase correlation if both clouds are large; else None.
+
+    Where one is small, it finds candidates, but says little of how good they are.
+    """
+    if len(scorers) == 1 or min(len(scorers[1].source), len(scorers[1].target)) <= LEVELS[0]:
+        return None
+    return phase_correlation(hypotheses, scorers)
+
+
 def weights_for(hypotheses: Hypotheses, scorers: Sequence[AlignmentScorer]) -> ChoiceWeights:
     """Return the weights of the choice among a model's candidates."""
-    if phase_correlation(hypotheses, scorers):
+    if correlation_of_large(hypotheses, scorers):
         return LARGE_CLOUDS
     return WITHOUT_MATCHABILITIES if hypotheses.unmatched_nll is None else CHOICE_WEIGHTS
 
@@ -73,10 +86,10 @@ def find_candidates(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Refine and measure hypotheses, drop copies, and add what the best may be mistaken for.
 
-    In large clouds the peaks of their phase correlation are hypotheses, too. A thing that is nearly
-    symmetric fits itself after half a turn. So the best candidates are turned by 180 degrees about
-    each principal axis as well, if a verification network can tell the turned ones from the right
-    one; the measures alone cannot.
+    If a cloud is large, the peaks of the phase correlation are hypotheses, too. A thing that is
+    nearly symmetric fits itself after half a turn. So the best candidates are turned by 180 degrees
+    about each principal axis as well, if a verification network can tell the turned ones from the
+    right one; the measures alone cannot.
 
     Args:
         hypotheses: of the model.
@@ -146,10 +159,10 @@ def measure(
         scorers: of the clouds; the first points of each are the model's.
 
     Returns:
-        (T, 5): agreement, coherence, unmatched loss, support, and phase correlation (0 where it is
-        not used).
+        (T, 5): agreement, coherence, unmatched loss, support, and phase correlation (0 unless
+        both clouds are large).
     """
-    correlation = phase_correlation(hypotheses, scorers)
+    correlation = correlation_of_large(hypotheses, scorers)
     rows = []
     for transform in transforms:
         agreement, coherence, distances = scorers[0].alignment(transform)
@@ -201,8 +214,9 @@ def refine_chosen(
     it is more exact: on points that the model has not seen, and on points that both clouds share.
     In large clouds the model's points are too few, and a candidate slides along the walls of a
     room: there it is shifted to the nearest peak of the phase correlation, and generalised ICP on
-    more and more points follows. Without phase correlation, generalised ICP starts from the chosen
-    transform and from EM-ICP's, and what agrees better is taken.
+    more and more points follows. Where only one cloud is large, or the model has no matches,
+    generalised ICP starts from the chosen transform and from EM-ICP's, and what agrees better is
+    taken.
 
     Args:
         transform: of the source onto the target.
@@ -210,7 +224,7 @@ def refine_chosen(
         subsamples: the clouds that they were made from.
         scorers: of the clouds, of more and more of their points.
     """
-    correlation = phase_correlation(hypotheses, scorers)
+    correlation = correlation_of_large(hypotheses, scorers)
     if correlation:
         return refine_coarse_to_fine(correlation.shifted(transform), scorers)
     chosen = transform

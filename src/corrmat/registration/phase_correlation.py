@@ -85,7 +85,7 @@ class PhaseCorrelation:
         moved = np.hstack([points @ rotation.T + translation, normals @ rotation.T])
         source = self._phases(moved)
         product = (source.conj() * self._target).sum(0)
-        return scipy.fft.irfftn(product, [self._size] * 3, axes=(0, 1, 2))
+        return np.asarray(scipy.fft.irfftn(product, [self._size] * 3, axes=(0, 1, 2)))
 
     def _phases(self, cloud: np.ndarray) -> np.ndarray:
         """Compute spectra of magnitude one of four grids: surfaces along each axis, and others.
@@ -101,7 +101,7 @@ class PhaseCorrelation:
         voxels = np.round(cloud[:, :3] @ self._target_frame.T / _VOXEL).astype(int) % self._size
         grid = np.zeros((4, *[self._size] * 3), np.float32)
         grid[kind, *voxels.T] = 1
-        spectrum = scipy.fft.rfftn(grid, axes=(1, 2, 3))
+        spectrum = np.asarray(scipy.fft.rfftn(grid, axes=(1, 2, 3)))
         magnitude = np.abs(spectrum)
         return spectrum / (magnitude + _FLOOR * magnitude.max())
 

@@ -13,9 +13,9 @@ from corrmat.calibration import Calibration, shipped_calibration, verdict
 from corrmat.errors import CorrmatError
 from corrmat.registration.choice import (
     choose,
+    correlation_of_large,
     find_candidates,
     measure,
-    phase_correlation,
     refine_chosen,
     weights_for,
 )
@@ -51,7 +51,8 @@ def register(
         model: "corrmat" for the shipped weights; "icp", or where they are installed "ransac",
             "ransac17", "fgr" or "kiss", for the classical pipelines; whatever else `load_model`
             takes; or a network, or a method, of your own.
-        refine: "icp": generalised ICP of all candidates of the model, EM-ICP of the best; or
+        refine: "icp": generalised ICP of all candidates of the model, then EM-ICP of the best, or
+            generalised ICP on more and more points where both clouds have more than 2,048; or
             "none": the candidates as they are.
         seed: of subsampling and of the model's random draws.
 
@@ -91,9 +92,9 @@ def register(
     agreement, coherence, _ = scorers[0].alignment(transform)
     support = hypotheses.support(transform, *subsamples)
     agrees = hypotheses.match_support(transform, *subsamples) > 0
-    correlation = phase_correlation(hypotheses, scorers)
-    large = (coherence, correlation.at(transform)) if correlation else ()
-    confidence = _calibration().confidence(agreement, support if len(agrees) else None, large)
+    large = correlation_of_large(hypotheses, scorers)
+    of_large = (coherence, large.at(transform)) if large else (None, None)
+    confidence = _calibration().confidence(agreement, support if len(agrees) else None, *of_large)
     fewest = min(len(x.rows), len(y.rows))
     if fewest < FEW_POINTS or (len(agrees) and not agrees.any()):
         confidence = min(confidence, DOUBTFUL)
@@ -106,7 +107,8 @@ def register(
         match_agrees=agrees,
         agreement=agreement,
         support=support,
-        large=large,
+        coherence=of_large[0],
+        correlation=of_large[1],
         confidence=confidence,
         rmse=rmse / scale,
         overlap=overlap,

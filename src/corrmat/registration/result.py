@@ -16,7 +16,8 @@ class Registration:
     match_agrees: np.ndarray  # (K,) bool: whether the transform takes one end near the other
     agreement: float  # in [0, 1]: how much of each cloud lies on the other
     support: float  # in [0, 1]: share of the matches that the transform explains; 1 without any
-    large: tuple[float, ...]  # coherence and phase correlation, of large clouds; empty for others
+    coherence: float | None  # of two clouds of more than 2,048 points; None for others
+    correlation: float | None  # their phase correlation; None for others
     confidence: float  # in [0, 1]: chance that the clouds are aligned, calibrated for "corrmat"
     rmse: float  # of aligned source points near a target point, in the clouds' units
     overlap: float  # share of source points near a target point: twice the spacing of points

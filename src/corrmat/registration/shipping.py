@@ -111,7 +111,7 @@ def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:
         results = benchmark.compare(pairs, [model, "icp"])
         if points == 512:
             recalls[protocol] = results[model].recall_5deg
-        scores += results[model].scores.tolist()
+        scores += results[model].scores
         aligned += results[model].aligned.tolist()
         for result in results.values():
             agreements += result.per_pair["agreement"]
@@ -123,15 +123,15 @@ def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:
         )
         (result,) = benchmark.compare(pairs, [model]).values()
         recalls[protocol] = result.recall_5deg
-        large_scores += result.scores.tolist()
+        large_scores += result.scores
         large_aligned += result.aligned.tolist()
     curve = Calibration(
-        both=_fit_logistic(np.array(scores), np.array(aligned, float)),
+        both=_fit_logistic(np.array(scores)[:, :2].astype(float), np.array(aligned, float)),
         large=_fit_logistic(np.array(large_scores), np.array(large_aligned, float)),
         agreement=_fit_logistic(np.array(agreements)[:, None], np.array(aligned_alone, float)),
     )
     for of, right in ((scores, aligned), (large_scores, large_aligned)):
-        sure = np.array([curve.confidence(a, b, large) >= SURE for a, b, *large in of])
+        sure = np.array([curve.confidence(*each) >= SURE for each in of])
         wrongly = np.mean(sure & ~np.array(right))
         called = f"{sure.mean():.1%} of {len(of)} held-out pairs, {wrongly:.1%} wrongly"
         print(f'called "aligned": {called}')

@@ -285,7 +285,7 @@ def _read_comparisons(results: Path) -> list[Comparison]:
 def _confidence(result: ModelResult) -> np.ndarray:
     """Compute what the shipped calibration promised for each pair."""
     calibration = shipped_calibration()
-    return np.array([calibration.confidence(a, b, large) for a, b, *large in result.scores])
+    return np.array([calibration.confidence(*scores) for scores in result.scores])
 
 
 def _recall_cells(result: ModelResult, ours: np.ndarray | None) -> list[str]:

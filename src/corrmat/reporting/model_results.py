@@ -4,6 +4,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,7 +12,7 @@ import torch
 from corrmat.files import replace_text
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG
 
-LARGE = "coherence", "correlation"  # of large clouds, beside agreement and support
+SCORES = "agreement", "support", "coherence", "correlation"  # see `Calibration.confidence`
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class ModelResult:
     recall_5deg: float
     recall_adds: float
     ms: float
-    per_pair: dict[str, list[float]]
+    per_pair: dict[str, list[Any]]  # numbers; None where a pair has no such score
 
     @property
     def within_angle(self) -> np.ndarray:
@@ -36,14 +37,10 @@ class ModelResult:
         return np.array(self.per_pair["adds"]) < ADDS_THRESHOLD
 
     @property
-    def scores(self) -> np.ndarray:
-        """Return what the confidence of each pair is computed from.
-
-        Returns:
-            (n, 2) agreement and support, or (n, 4) with `LARGE`.
-        """
-        names = ["agreement", "support", *(name for name in LARGE if name in self.per_pair)]
-        return np.array([self.per_pair[name] for name in names]).T
+    def scores(self) -> list[tuple[Any, ...]]:
+        """Return what the confidence of each pair is computed from, as `SCORES`; else None."""
+        none = [None] * len(self.per_pair["agreement"])
+        return list(zip(*(self.per_pair.get(name, none) for name in SCORES), strict=True))
 
 
 @dataclass(frozen=True)
