@@ -87,7 +87,7 @@ def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> Pair
         in_units = [to_original_units(t, scale, x.centre, y.centre) for t in transforms]
         return np.array([benchmark.errors(pairs, index, t) for t in in_units])
 
-    found, measures = find_candidates(hypotheses, subsamples, scorers)
+    found, measures = find_candidates(hypotheses, subsamples, scorers, half_turns=True)
     true = refine_some(truth[None], hypotheses, scorers[0])
     candidates = np.concatenate([found, true])
     gicp = [scorers[0].refine(each) for each in candidates]

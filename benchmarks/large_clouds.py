@@ -132,7 +132,7 @@ def choices_of(
     hypotheses = generate(*subsamples, 0)
     own = choice.refine_some(hypotheses.transforms, hypotheses, scorers[0])
     own_measures = choice.measure(own, hypotheses, subsamples, scorers)
-    found, measures = choice.find_candidates(hypotheses, subsamples, scorers)
+    found, measures = choice.find_candidates(hypotheses, subsamples, scorers, half_turns=True)
 
     def chosen(among: np.ndarray, measured: np.ndarray, weights: ChoiceWeights) -> np.ndarray:
         best = choice.choose(

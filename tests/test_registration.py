@@ -25,7 +25,6 @@ from corrmat.data.scans import read_scan, write_ply
 from corrmat.data.shapes.dataset import make_shape
 from corrmat.errors import CorrmatError
 from corrmat.methods import InvariantCorr
-from corrmat.networks.verification import VerificationNetwork
 from corrmat.ops import rigid
 from corrmat.ops.correspondence import MatchabilityCorrespondence, SoftCorrespondence
 from corrmat.options import REGISTER_EPILOG
@@ -765,12 +764,11 @@ def test_half_a_turn_of_the_best_candidate_is_a_candidate_too():
     np.testing.assert_allclose(np.trace(half, axis1=1, axis2=2), 0, atol=1e-9)
     for turn in turns:
         mistaken = Hypotheses(turn[None], np.empty((0, 2), int), np.empty(0))
-        mistaken = mistaken._replace(verification=VerificationNetwork())
-        found, measures = choice.find_candidates(mistaken, subsamples, scorers)
+        clouds = subsamples, scorers
+        found, measures = choice.find_candidates(mistaken, *clouds, half_turns=True)
         assert len(found) == len(measures) == 4
         assert np.linalg.norm(found - truth, axis=(1, 2)).min() < 0.01
-        alone = mistaken._replace(verification=None)  # as of ICP, which stays where it is
-        assert len(choice.find_candidates(alone, subsamples, scorers)[0]) == 1
+        assert len(choice.find_candidates(mistaken, *clouds, half_turns=False)[0]) == 1
 
 
 def test_a_fragment_of_a_room_that_lies_right_stays_there():

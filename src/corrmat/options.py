@@ -77,7 +77,7 @@ protocols:
   paper   the pairs of experiment 1.2
 
 classical pipelines: icp; ransac and fgr, over FPFH features; ransac17, RANSAC with seventeen
-candidates, where corrmat has up to forty-one; kiss, KISS-Matcher."""
+candidates, where corrmat's network has up to forty-one; kiss, KISS-Matcher."""
 
 REGISTER_EPILOG = """examples:
   corrmat register scan1.ply scan2.ply

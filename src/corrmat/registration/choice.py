@@ -83,18 +83,21 @@ def find_candidates(
     hypotheses: Hypotheses,
     subsamples: tuple[np.ndarray, np.ndarray],
     scorers: Sequence[AlignmentScorer],
+    *,
+    half_turns: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Refine and measure hypotheses, drop copies, and add what the best may be mistaken for.
 
     If a cloud is large, the peaks of the phase correlation are hypotheses, too. A thing that is
     nearly symmetric fits itself after half a turn. So the best candidates are turned by 180 degrees
-    about each principal axis as well, if a verification network can tell the turned ones from the
-    right one; the measures alone cannot.
+    about each principal axis as well.
 
     Args:
         hypotheses: of the model.
         subsamples: the clouds that they were made from.
         scorers: of the clouds, of more and more of their points.
+        half_turns: whether to add them. Only a verification network can tell them from the right
+            transform; the measures cannot.
 
     Returns:
         Transforms (T, 4, 4), half turns last, and their measures (T, 5).
@@ -107,7 +110,7 @@ def find_candidates(
         transforms = np.concatenate([transforms, peaks])
     refined = refine_some(transforms, hypotheses, scorer)
     measures = measure(refined, hypotheses, subsamples, scorers)
-    if hypotheses.verification is None:
+    if not half_turns:
         return refined, measures
     weights = weights_for(hypotheses, scorers)
     best = refined[best_by_measures(measures, weights, HALF_TURNED)]

@@ -78,7 +78,10 @@ def register(
     hypotheses = generate(*subsamples, seed)
 
     if refine == "icp":
-        candidates, measures = find_candidates(hypotheses, subsamples, scorers)
+        half_turns = hypotheses.verification is not None
+        candidates, measures = find_candidates(
+            hypotheses, subsamples, scorers, half_turns=half_turns
+        )
     else:
         candidates = hypotheses.transforms
         measures = measure(candidates, hypotheses, subsamples, scorers)

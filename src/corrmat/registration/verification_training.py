@@ -80,12 +80,13 @@ def train_verification(
         workers: processes that make candidates; 0 makes them in this one.
     """
     verified = weights.checksum(weights.load_model())
-    folder = runs / f"verification-{verified}"
-    shards = {number: folder / f"{seed}-{number}.pt" for number in range(-(-pairs // SHARD_PAIRS))}
+    folder = runs / f"verification-{verified}" / data
+    count = min(pairs, SHARD_PAIRS)
+    shards = {n: folder / f"{seed}-{n}-{count}.pt" for n in range(-(-pairs // SHARD_PAIRS))}
     missing = {number: path for number, path in shards.items() if not path.is_file()}
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers or 1, spawn, torch.set_num_threads, (1,)) as pool:
-        write = functools.partial(write_shard, data=data, seed=seed, count=min(pairs, SHARD_PAIRS))
+        write = functools.partial(write_shard, data=data, seed=seed, count=count)
         written = (pool.map if workers else map)(write, missing.values(), missing)
         for _ in track(written, "candidates", len(missing), transient=True):
             pass
@@ -145,17 +146,16 @@ def candidate_set(pairs: PairBatch, generate: NetworkHypotheses) -> CandidateSet
     hypotheses = generate(*subsamples, 0)
     truth = rigid.to_homogeneous(pairs.rotation[0], pairs.translation[0])
     truth = from_original_units(truth, scale, x.centre, y.centre)
-    found, measures = find_candidates(hypotheses, subsamples, scorers)
-    best = found[best_by_measures(measures, CHOICE_WEIGHTS, VERIFIED)]
-    true = refine_some(truth[None], hypotheses, scorers[0])
-    turned = refine_some(half_turned(true[0], subsamples), hypotheses, scorers[0])
-    transforms = np.concatenate([best, turned, true])
-    points = subsamples[0][:, :3]
-    offsets = points @ (transforms - truth)[:, :3, :3].transpose(0, 2, 1)
+    candidates, measures = find_candidates(hypotheses, subsamples, scorers, half_turns=True)
+    best = candidates[best_by_measures(measures, CHOICE_WEIGHTS, VERIFIED)]
+    refined = refine_some(truth[None], hypotheses, scorers[0])
+    half_turns = refine_some(half_turned(refined[0], subsamples), hypotheses, scorers[0])
+    transforms = np.concatenate([best, half_turns, refined])
+    offsets = subsamples[0][:, :3] @ (transforms - truth)[:, :3, :3].transpose(0, 2, 1)
     offsets += (transforms - truth)[:, None, :3, 3]
     right = np.linalg.norm(offsets, axis=2).mean(1) < RIGHT
-    features, seen, nearest = evidence(transforms, hypotheses, subsamples)
-    return CandidateSet(features.half(), seen.half(), nearest.short(), torch.from_numpy(right))
+    features, points, nearest = evidence(transforms, hypotheses, subsamples)
+    return CandidateSet(features.half(), points.half(), nearest.short(), torch.from_numpy(right))
 
 
 class VerificationTraining(L.LightningModule):
@@ -171,18 +171,18 @@ class VerificationTraining(L.LightningModule):
         self.network = VerificationNetwork()
 
     def training_step(self, batch: Sequence[CandidateSet], index: int) -> Tensor:
-        """Compute the loss of some pairs, each turned at random."""
-        seen = torch.cat([_turned(each.evidence.float()) for each in batch])
+        """Compute the loss of some pairs, each rotated at random."""
+        points = torch.cat([_rotated(each.evidence.float()) for each in batch])
         nearest = torch.cat([each.nearest.long() for each in batch])
         features = torch.cat(
             [each.features.float().expand(len(each.right), -1, -1) for each in batch]
         )
-        with torch.autocast(seen.device.type, torch.bfloat16):
-            score = self.network(features, seen, nearest)
+        with torch.autocast(points.device.type, torch.bfloat16):
+            score = self.network(features, points, nearest)
         scores = score.float().split([len(each.right) for each in batch])
         losses = [
-            torch.logsumexp(own, 0) - torch.logsumexp(own[each.right], 0)
-            for own, each in zip(scores, batch, strict=True)
+            torch.logsumexp(logits, 0) - torch.logsumexp(logits[each.right], 0)
+            for logits, each in zip(scores, batch, strict=True)
         ]
         loss = torch.stack(losses).mean()
         self.log("loss", loss, prog_bar=True, batch_size=len(batch))
@@ -195,7 +195,7 @@ class VerificationTraining(L.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
 
-def _turned(seen: Tensor) -> Tensor:
-    """Turn or mirror the positions of all points (T, P, EVIDENCE) alike."""
-    turn = torch.linalg.qr(torch.randn(3, 3))[0]
-    return torch.cat([seen[..., :-3], seen[..., -3:] @ turn], -1)
+def _rotated(points: Tensor) -> Tensor:
+    """Rotate or mirror the positions of all points (T, P, EVIDENCE) alike, at random."""
+    rotation = torch.linalg.qr(torch.randn(3, 3))[0]
+    return torch.cat([points[..., :-3], points[..., -3:] @ rotation], -1)

@@ -79,9 +79,8 @@ class Evidence:
 
     @property
     def where(self) -> str:
-        """Scale, data set, and the seed unless it is 0."""
-        seed = f", seed {self.record.seed}" if self.record.seed else ""
-        return f"{self.record.scale}, {self.record.data}{seed}"
+        """See `Record.trained_on`."""
+        return self.record.trained_on
 
     def left_identity(self, errors: PairErrors) -> bool:
         """Tell whether an arm is clearly better than guessing the identity."""

@@ -9,7 +9,7 @@ import yaml
 
 from corrmat.data.registry import DATASETS, is_generated
 from corrmat.methods import METHODS
-from corrmat.reporting.record import COMMITS, Record
+from corrmat.reporting.record import COMMIT_SEPARATOR, Record
 from corrmat.revision import PACKAGE, git
 
 # The modules that compute an arm's numbers; what they import belongs to it, up to the boundary.
@@ -47,7 +47,7 @@ def staleness(record: Record, repository: Path) -> str:
         repository: a checkout that has these commits.
     """
     trained = (str(arm.trained_at or record.commit) for arm in record.arms.values())
-    commits = {commit for each in trained for commit in each.split(COMMITS)}
+    commits = {commit for each in trained for commit in each.split(COMMIT_SEPARATOR)}
     if any(name == "None" or name.endswith("+") for name in commits):
         return "trained with uncommitted code"
     code = [f"src/{path}" for path in code_of(record.family, record.arms)]
@@ -88,6 +88,8 @@ def code_of(family: str, arms: Iterable[str]) -> list[str]:
     methods = [name for name in METHODS if name in arms or name.split("_")[0] == family]
     networks = {METHODS[name].network_type.__module__ for name in methods or METHODS}
     pending, reached = {*_ROOTS, *networks}, set[str]()
+    if nowhere := [module for module in pending if _path(module) is None]:
+        raise ModuleNotFoundError(f"{', '.join(sorted(nowhere))}: no such module")
     while pending:
         module = pending.pop()
         path = _path(module)

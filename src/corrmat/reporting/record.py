@@ -137,6 +137,12 @@ class Record:
         return place_of(self.scale, self.data, self.id, self.seed)
 
     @property
+    def trained_on(self) -> str:
+        """Scale, data set, and the seed unless it is 0: they tell an experiment's records apart."""
+        seed = f", seed {self.seed}" if self.seed else ""
+        return f"{self.scale}, {self.data}{seed}"
+
+    @property
     def compared(self) -> list[str]:
         """The arms METHOD and METHOD_corr, as far as there are any."""
         return [arm for arm in (self.baseline, self.treatment) if arm is not None]
@@ -163,7 +169,7 @@ class Record:
         return Record(**fields)  # pyright: ignore[reportArgumentType] (our own file)
 
 
-COMMITS = " / "  # between the commits of an arm that was trained by more than one
+COMMIT_SEPARATOR = " / "  # between the commits of an arm that was trained by more than one
 
 
 def place_of(scale: str, data: str, identity: str, seed: int) -> Path:

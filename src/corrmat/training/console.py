@@ -56,6 +56,11 @@ class Board:
         """Whether anything is drawn."""
         return self._live is not None
 
+    @property
+    def is_due(self) -> bool:
+        """Whether it is time to draw again."""
+        return self.is_visible and time.monotonic() - self._last_drawn > REFRESH
+
     def __enter__(self) -> Self:
         if self._live is not None:
             self._live.__enter__()
@@ -74,7 +79,7 @@ class Board:
     def update(self, arm: str, **cells: str) -> None:
         """Change cells of an arm's row; the board is drawn a few times a second at most."""
         self.rows.setdefault(arm, {}).update({k.replace("_", " "): v for k, v in cells.items()})
-        if self._live is not None and time.monotonic() - self._last_drawn > REFRESH:
+        if self._live is not None and self.is_due:
             self._last_drawn = time.monotonic()
             self._live.update(self.table(), refresh=True)
 
@@ -114,11 +119,12 @@ class BoardProgress(Callback):
         batch_idx: int,
     ) -> None:
         """Update speed, loss and time left."""
-        if not self.board.is_visible or self._start is None:
-            return
+        step, total = trainer.global_step, trainer.estimated_stepping_batches
+        is_shown = self.board.is_due or (self.board.is_visible and step == total)
+        if not is_shown or self._start is None:
+            return  # before the loss is read: a GPU would have to be waited for
         start, pairs, steps = self._start
         seconds = max(time.monotonic() - start, 1e-9)
-        step, total = trainer.global_step, trainer.estimated_stepping_batches
         finite = math.isfinite(total)  # a run may end by the clock alone
         left = seconds / max(step - steps, 1) * (total - step)
         values = trainer.callback_metrics

@@ -14,7 +14,7 @@ import torch
 import yaml
 
 from corrmat.files import replace_text
-from corrmat.reporting.record import COMMITS
+from corrmat.reporting.record import COMMIT_SEPARATOR
 from corrmat.training.preflight import Arm
 from corrmat.training.recipe import Recipe, Settings, default_settings, merge
 from corrmat.weights import checksum, load_model
@@ -107,7 +107,7 @@ def start_run(folder: Path, arm: Arm, commit: str | None) -> None:
 
 def commits_of(folder: Path) -> str | None:
     """Return the commits of the code that trained a run, e.g. "9d7c4941ea0b / a0ddfb6c5d12"."""
-    return COMMITS.join(_commits(folder)) or None
+    return COMMIT_SEPARATOR.join(_commits(folder)) or None
 
 
 def _commits(folder: Path) -> list[str]:
