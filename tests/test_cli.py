@@ -1,11 +1,16 @@
 import subprocess
 import sys
+from typing import get_args
 
 import pytest
 from conftest import ROOT
 
 import corrmat
+from corrmat import options as command_options
 from corrmat.cli import main
+from corrmat.registration import benchmark
+from corrmat.reporting.claims import HIGH_RATE_CONTROL
+from corrmat.training import loggers, recipe
 
 FIT = ["fit", "--config", str(ROOT / "configs" / "exp" / "1.1.yaml"), "--scale", "smoke"]
 
@@ -26,6 +31,27 @@ def test_a_script_of_reproduce_is_the_whole_experiment(tmp_path):
     assert process.stdout.count("step ") == 4  # a line a validation
     assert "Warning" not in process.stderr
     assert (tmp_path / "results" / "smoke" / "shapes" / "1.2" / "metrics.json").is_file()
+
+
+def test_the_command_has_the_choices_of_the_library():
+    assert get_args(command_options.Scale) == recipe.SCALES
+    assert get_args(command_options.Logger) == get_args(loggers.Choice)
+    assert get_args(command_options.Protocol) == get_args(benchmark.Protocol)
+    assert {*get_args(benchmark.Protocol)} == {*benchmark.PROTOCOLS, *benchmark.SCANS}
+
+
+def test_public_names_can_be_imported_and_are_listed():
+    assert [*corrmat.__all__] == sorted(corrmat.__all__)
+    for name in corrmat.__all__:
+        assert getattr(corrmat, name) is not None
+    assert {*corrmat._MODULES} <= {*corrmat.__all__}
+
+
+@pytest.mark.parametrize("experiment", ["2.1", "2.2", "2.3", "2.4"])
+def test_recipes_have_the_control_that_claims_ask_for(experiment):
+    """Without it three kinds of claims would be missing from the ledger."""
+    loaded = recipe.load(ROOT / "configs" / "exp" / f"{experiment}.yaml", "laptop")
+    assert HIGH_RATE_CONTROL in loaded.controls
 
 
 def test_the_version_is_told(capsys):

@@ -97,7 +97,10 @@ verdict: "aligned" from a confidence of 94 % on, "probably aligned" from 50 %, e
 It was fitted on simulated pairs of objects and rooms: look at --html before you rely on it.
 exit codes: 0 done, whatever the verdict; 2 a file cannot be used, and one line says why."""
 
+# The library's own choices; importing those would import torch.
 Scale = Literal["smoke", "laptop", "overnight", "paper"]
+Logger = Literal["none", "csv", "wandb"]
+Protocol = Literal["paper", "real", "views", "clean", "dense", "rooms"]
 RESULTS_HELP = "folder of the records"
 EXPERIMENT_COMMANDS = ("run", "fit", "evaluate")
 
@@ -253,7 +256,7 @@ def _add_experiment_options(
     parser.add_argument("--runs", type=Path, default=Path("runs"), help="folder of checkpoints")
     if name in ("run", "fit"):
         parser.add_argument(
-            "--logger", type=Literal["none", "csv", "wandb"], default="wandb",
+            "--logger", type=Logger, default="wandb",
             help="wandb: CSV and wandb offline; csv; none. The record is written in any case",
         )  # fmt: skip
         parser.add_argument(
@@ -281,12 +284,7 @@ def _add_experiment_options(
 def _add_compare_options(parser: ArgumentParser) -> None:
     """Add the options of compare."""
     parser.add_argument("models", help="e.g. corrmat,ransac,fgr,icp or checkpoint files")
-    parser.add_argument(
-        "--protocol",
-        type=Literal["paper", "real", "views", "clean", "dense", "rooms"],
-        default="real",
-        help="see below",
-    )
+    parser.add_argument("--protocol", type=Protocol, default="real", help="see below")
     parser.add_argument(
         "--data", default="shapes", help="shapes, assemblies, rooms, modelnet40 or folder"
     )
