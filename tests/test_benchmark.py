@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from corrmat.data.scan_pairs import OVERLAP, make_object_pair, make_room_pair
 from corrmat.errors import CorrmatError
 from corrmat.registration import benchmark, shipping
 from corrmat.reporting import comparisons
+from corrmat.reporting.model_results import write_comparison
 
 
 @pytest.fixture
@@ -90,6 +92,20 @@ def test_the_command_prints_one_table_and_writes_a_record(pairs, tmp_path, capsy
     rows = [row.split(" | ") for row in confidence.splitlines() if "| shapes |" in row]
     assert sum(int(row[2]) for row in rows) == 4
     assert "4 pairs of small clouds: expected calibration error over 10 bins 0." in confidence
+
+
+def test_unrelated_pairs_are_counted_below_the_confidence(tmp_path):
+    pairs = benchmark.frozen_pairs("clean", points=256, count=3)
+    strangers = benchmark.unrelated(pairs, 2)
+    assert torch.equal(strangers.source, pairs.source[:2])
+    assert torch.equal(strangers.target, pairs.target[[1, 0]])
+    result = benchmark.summarise(strangers, [benchmark.Outcome(90, 1, 5, 0.0, 0.0, 0.0, 0.0)] * 2)
+    about = {"protocol": "rooms", "points": 256, "unrelated": asdict(result)}
+    write_comparison(
+        tmp_path / "register" / "rooms-procedural-256.json", {"corrmat": result}, about
+    )
+    last = comparisons.confidence_table(tmp_path).splitlines()[-1]
+    assert last == "2 unrelated pairs of rooms: 0 aligned, 0 probably aligned, 2 doubtful."
 
 
 def test_calibration_intervals_and_paired_test_by_hand():

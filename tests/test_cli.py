@@ -101,6 +101,7 @@ def test_help_of_a_command_lists_typed_settings(capsys):
         (["--trainer.val_check_interval", "0"], "val_check_interval 0 leaves nothing to do"),
         (["--arm", "ICP"], "unknown arm 'ICP'"),
         (["--config", "nowhere.yaml"], "no recipe nowhere.yaml"),
+        (["--config", sys.executable], "is not YAML"),
     ],
 )
 def test_bad_input_is_one_line_and_writes_nothing(options, message, capsys, tmp_path, monkeypatch):
@@ -124,6 +125,22 @@ def test_bad_commands_exit_with_2(words, capsys):
         code = stopped.code
     assert code == 2
     assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["register", "a.ply"], "required: target; see corrmat register --help"),
+        (["register", "a.ply", "b.ply", "--jsn", "x"], "see corrmat register --help"),
+        (["nonsense"], "see corrmat --help"),
+        (["register", "a.ply", "b.ply", "--gif", "a.png"], "the animation is a GIF, a.png has"),
+        (["report", "-o", "."], ". is a folder, not a file to write"),
+        (["compare", "icp", "--data", "modelnet40"], "or --root ..."),
+    ],
+)
+def test_a_message_says_where_to_look(words, message, capsys):
+    assert main(words) == 2
+    assert message in capsys.readouterr().err
 
 
 def test_corrmat_alone_says_what_it_can_do(capsys):

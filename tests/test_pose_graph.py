@@ -78,6 +78,16 @@ def test_a_scan_that_fits_nowhere_is_doubtful(world):
     assert [pose.verdict for pose in others] == ["aligned"] * 2
 
 
+def test_a_scan_that_most_registrations_contradict_is_doubtful(world):
+    """However sure the one is that gives its pose."""
+    scans, _, wrong, _ = world
+    wrong |= {(0, 1): 0.6, (0, 2): 0.7, (0, 3): 0.8}
+    first, *others = register_scans(scans)
+    assert first.verdict == "doubtful: 1 of 3 registrations agree"
+    assert first.confidence < 0.5
+    assert [pose.verdict for pose in others] == ["aligned"] * 2
+
+
 def test_averaging_is_better_than_one_registration(world):
     scans, poses, _, noise = world
     noise["deg"] = 1.0

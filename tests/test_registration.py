@@ -826,6 +826,13 @@ def test_a_room_whose_matches_are_wrong_is_registered_by_phase_correlation(monke
     assert moved_m(room, registered(room)) > 1
 
 
+def test_large_clouds_that_have_nothing_in_common_are_doubtful():
+    rooms = [make_room_pair(index, 20_000, "val") for index in (0, 1)]
+    thing = make_object_pair(0, 20_000, "val")
+    for other in (rooms[1], thing):
+        assert corrmat.register(rooms[0].source, other.target).verdict.startswith("doubtful")
+
+
 def test_a_small_scan_of_a_large_one_is_judged_as_small_clouds_are():
     """The curve of large clouds calls such a pair "probably aligned" at best."""
     scans = make_object_pair(0, 20_000, "val")

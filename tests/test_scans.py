@@ -192,6 +192,9 @@ def _bytes_of(array):
         ("german.csv", b"x;y;z\n1,5;2,5;3,5\n", "need a decimal point"),
         ("complex.npy", _bytes_of(np.ones((9, 3), complex)), "complex128"),
         ("side.npy", _bytes_of(np.ones((4, 40))), "transpose it"),
+        ("depth.npy", _bytes_of(np.ones((48, 64))), "a depth image has to be turned into points"),
+        ("cut.csv", b"x,y,z\n1,2,3\n4", "row 2 holds 1 number"),
+        ("foot.csv", b"1,2,3\n4,5,6\n2 points exported", "row 3 holds 1 number"),
         ("german.txt", b"1,5 2,5 3,5\n2,0 1,0 0,5\n", "need a decimal point"),
         ("short.txt", b"1 2 3\n4 5\n", "row 2 holds 2 numbers"),
         ("words.csv", b"x,y\nz,u\n", "the header names x, y, but not x, y and z"),
@@ -224,6 +227,15 @@ def test_a_file_cut_short_is_an_error_not_fewer_points(tmp_path, kind):
     path.write_bytes(whole[: int(0.7 * len(whole))])
     with pytest.raises(CorrmatError, match=f"cannot be read as {kind[1:].upper()}"):
         read_scan(path)
+
+
+def test_a_pcd_of_text_cut_short_is_an_error(tmp_path):
+    fields = "FIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nCOUNT 1 1 1"
+    size = "WIDTH 4\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 4\nDATA ascii"
+    rows = "0 0 0\n1 0 0\n0 1 0\n"
+    (tmp_path / "cut.pcd").write_text(f"VERSION .7\n{fields}\n{size}\n{rows}")
+    with pytest.raises(CorrmatError, match="is cut short: 3 of 4 points"):
+        read_scan(tmp_path / "cut.pcd")
 
 
 def test_an_array_of_words_is_not_points(tmp_path):

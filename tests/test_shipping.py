@@ -35,6 +35,7 @@ def package(tmp_path, monkeypatch):
     monkeypatch.setattr(weights, "SHIPPED", copy)
     monkeypatch.setattr(shipping, "CALIBRATION_PAIRS", {512: 3})
     monkeypatch.setattr(shipping, "CALIBRATION_SCANS", 2)
+    monkeypatch.setattr(shipping, "CALIBRATION_UNRELATED", 2)
     monkeypatch.setattr(shipping, "SCAN_POINTS", 6000)
     monkeypatch.setattr("corrmat.data.shapes.dataset.SIZE", {"train": 200, "test": 10})
     monkeypatch.setattr("corrmat.data.shapes.dataset.ASSEMBLIES", {"train": 20, "test": 10})
@@ -55,7 +56,7 @@ def test_a_checkpoint_becomes_the_weights_of_the_package(checkpoint, package, tm
     calibration = shipped_calibration()
     assert [*map(len, (calibration.both, calibration.large, calibration.agreement))] == [3, 5, 2]
     assert 0 < calibration.confidence(0.5, 0.5) < 1
-    assert 0 < calibration.confidence(0.5, 0.5, (0.1, 0.3)) < 1
+    assert 0 < calibration.confidence(0.5, 0.5, 0.1, 0.3) < 1
     trained, shipped = load_model(checkpoint).state_dict(), load_model().state_dict()
     assert trained.keys() == shipped.keys()
     assert all(torch.equal(trained[key], shipped[key]) for key in trained)

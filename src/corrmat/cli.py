@@ -263,6 +263,8 @@ def _register(options: Namespace) -> int:
 
     files = [*filter(None, (options.json, options.html, options.gif)), *_moved_files(options)]
     written = [path.resolve() for path in files]
+    if options.gif is not None and options.gif.suffix.lower() not in (".gif", ""):
+        raise CorrmatError(f"the animation is a GIF, {options.gif} has another suffix")
     for path in files:
         if written.count(path.resolve()) > 1:
             raise CorrmatError(f"{path} is named for two results, and one would be lost")
@@ -446,6 +448,7 @@ def _report(options: Namespace) -> int:
     if output is not None:
         from corrmat.reporting.page import build_page
 
+        _refuse_folder(output)
         if not output.parent.is_dir():
             raise CorrmatError(f"no folder {output.parent} to write into")
         content = build_page(results)

@@ -51,7 +51,9 @@ def load(split: str, count: int | None = None, root: Path | None = None) -> Clou
         CorrmatError: a folder, list or file is missing or damaged; the message names it.
     """
     if root is None:
-        raise CorrmatError("data set modelnet40 needs its folder: ROOT=... or --data.root ...")
+        raise CorrmatError(
+            "data set modelnet40 needs its folder: ROOT=..., --data.root ... or --root ..."
+        )
     folder = _find_folder(root)
     names = tuple(_read_lines(folder / "shape_names.txt"))
     # The official lists say "data/modelnet40_ply_hdf5_2048/<file>": only the name counts.
@@ -137,7 +139,7 @@ def _find_folder(root: Path) -> Path:
             return folder
     raise CorrmatError(
         f"no ModelNet40 in {root} (looked for shape_names.txt and {FOLDER}/); "
-        f"unpack {SOURCE} there, or use --data.data shapes"
+        f"unpack {SOURCE} there, or take the data set shapes"
     )
 
 

@@ -24,6 +24,7 @@ CLOUDS = (".pcd", ".xyz", ".txt", ".csv", ".asc", ".pts", ".npy", ".npz")
 SAMPLES = 20_000  # points taken of a mesh's surface
 _POINTS = ("points", "xyz", "pos")  # usual names of an array of points beside others
 _XYZ = {"x", "y", "z"}
+_MOST_COLUMNS = 32  # of an array of points: x, y, z, and whatever else was measured
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+").fullmatch
 _FACES = re.compile(rb"^element (face|tristrips) +[1-9]", re.MULTILINE)
 
@@ -88,6 +89,11 @@ def read_shape(path: Path) -> "np.ndarray | trimesh.Trimesh":
         if len(points) <= 6 < points.shape[1]:
             raise CorrmatError(
                 f"{path} holds an array of shape {points.shape}: transpose it to (N, 3)"
+            )
+        if points.shape[1] > _MOST_COLUMNS:
+            raise CorrmatError(
+                f"{path} holds an array of shape {points.shape}, not points (N, 3): a depth image "
+                "has to be turned into points first"
             )
         points = np.ascontiguousarray(points[:, :3], np.float64)
     except CorrmatError:
@@ -247,7 +253,11 @@ def _pcd(path: Path) -> np.ndarray:
     """Read the points of a PCD file."""
     from pypcd4.pypcd4 import PointCloud
 
-    return PointCloud.from_path(path).numpy(("x", "y", "z"))
+    cloud = PointCloud.from_path(path)
+    points = cloud.numpy(("x", "y", "z"))
+    if len(points) != cloud.metadata.points:
+        raise CorrmatError(f"{path} is cut short: {len(points)} of {cloud.metadata.points} points")
+    return points
 
 
 def _numpy(path: Path) -> np.ndarray:
@@ -280,9 +290,9 @@ def _text(path: Path) -> np.ndarray:
     last = re.split(r"[;\s]+", lines[-1])
     if len(last) > 1 and all(map(_DECIMAL_COMMA, last)):
         raise CorrmatError(f"{path}: numbers like 1,5 need a decimal point")
-    separator = next((mark for mark in ";," if mark in lines[-1]), None)
     if lines[0].isdigit():  # the number of points, in XYZ files
         del lines[0]
+    separator = next((mark for mark in ";," if mark in "".join(lines[:2])), None)
     columns = [0, 1, 2]
     first = _cells(lines[0].lstrip("/ "), separator) if lines else []
     if lines and not any(map(_is_number, first)):  # a header

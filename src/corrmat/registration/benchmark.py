@@ -2,7 +2,7 @@
 
 import statistics
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -124,6 +124,15 @@ def _pair_scans(pairs: Sequence[ScanPair]) -> PairBatch:
 def _repeated(points: np.ndarray, count: int) -> np.ndarray:
     """Repeat the points of a cloud (N, 3) to `count`."""
     return points[np.arange(count) % len(points)]
+
+
+def unrelated(pairs: PairBatch, count: int) -> PairBatch:
+    """Give the sources of the first `count` pairs the target of the pair before: no pose is right.
+
+    The true transforms of the result mean nothing.
+    """
+    first = {field.name: getattr(pairs, field.name)[:count] for field in fields(pairs)}
+    return PairBatch(**first | {"target": first["target"].roll(1, 0)})
 
 
 def compare(pairs: PairBatch, models: Sequence[str]) -> dict[str, ModelResult]:

@@ -15,7 +15,7 @@ from corrmat.calibration import verdict
 from corrmat.errors import CorrmatError
 from corrmat.ops import rigid
 from corrmat.registration.preparation import Cloud
-from corrmat.registration.register import Refine, register
+from corrmat.registration.register import DOUBTFUL, Refine, register
 from corrmat.registration.result import matrix_lines
 
 _SWEEPS = 50  # of averaging; poses settle within ten
@@ -29,7 +29,8 @@ class ScanPose:
     """The pose of one of several scans."""
 
     transform: np.ndarray  # (4, 4) float64, T_target_scan, in the scans' own units
-    confidence: float  # of the weakest registration on the surest way to the target
+    confidence: float  # of the weakest registration on the surest way to the target; low if most
+    # registrations of this scan do not agree with the poses
     agree: int  # registrations of this scan that agree with the poses
     verdict: str  # as of a `Registration`
 
@@ -135,6 +136,8 @@ class _PoseGraph:
         transform = rigid.to_homogeneous(rotation, translation)
         confidence, mine = float(self.confidence[index]), self._edges_of(index)
         agree = sum(self._agrees(index, *self._predict(index, edge)) for edge in mine)
+        if 2 * agree < len(mine):
+            confidence = min(confidence, DOUBTFUL)
         reason = f"{agree} of {len(mine)} registrations agree"
         return ScanPose(transform, confidence, agree, verdict(confidence, reason))
 

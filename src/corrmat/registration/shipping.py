@@ -24,6 +24,7 @@ from corrmat.types import PairBatch
 CALIBRATION_PAIRS = {512: 200, 1024: 100}  # of a protocol, by points of a cloud
 CALIBRATION_PROTOCOLS: tuple[benchmark.Protocol, ...] = ("real", "views", "clean")
 CALIBRATION_SCANS = 150  # pairs of each protocol of large clouds
+CALIBRATION_UNRELATED = 50  # such pairs whose clouds have nothing in common
 SCAN_POINTS = 20_000
 
 
@@ -92,9 +93,10 @@ def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:
     """Fit the chance that a pair is aligned to its agreement and support.
 
     Logistic regression on held-out pairs of three difficulties, and of large clouds on a curve of
-    their own; `Calibration` applies it. The curve over the agreement alone, for models without
-    matches, is fitted on ICP's outcomes as well: most of them are wrong, where few of the
-    network's are.
+    their own; `Calibration` applies it. So few large clouds come out wrong that pairs of unrelated
+    ones are added: without them any two would be "probably aligned". The curve over the agreement
+    alone, for models without matches, is fitted on ICP's outcomes as well: most of them are wrong,
+    where few of the network's are.
 
     Args:
         model: as `register` takes it.
@@ -121,10 +123,11 @@ def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:
         pairs = benchmark.frozen_pairs(
             protocol, points=SCAN_POINTS, count=CALIBRATION_SCANS, split="val"
         )
-        (result,) = benchmark.compare(pairs, [model]).values()
+        strangers = benchmark.unrelated(pairs, CALIBRATION_UNRELATED)
+        result, wrong = (benchmark.compare(each, [model])[model] for each in (pairs, strangers))
         recalls[protocol] = result.recall_5deg
-        large_scores += result.scores
-        large_aligned += result.aligned.tolist()
+        large_scores += result.scores + wrong.scores
+        large_aligned += [*result.aligned.tolist(), *[False] * len(strangers)]
     curve = Calibration(
         both=_fit_logistic(np.array(scores)[:, :2].astype(float), np.array(aligned, float)),
         large=_fit_logistic(np.array(large_scores), np.array(large_aligned, float)),

@@ -21,6 +21,7 @@ _PROTOCOLS = ("real", "views", "clean", "dense", "rooms")  # in the order of the
 _SMALL = "real", "views", "clean"  # clouds of at most 1,024 points
 # Protocols of each kind of clouds.
 _KINDS = {"small clouds": _SMALL, "dense scans of objects": ("dense",), "rooms": ("rooms",)}
+_VERDICTS = "aligned", "probably aligned", "doubtful"
 _BINS = 10  # of the expected calibration error
 
 
@@ -169,7 +170,8 @@ def large_choice_table(results: Path) -> str:
 def confidence_table(results: Path) -> str:
     """Build the table of verdicts: what their confidence promised, and what was so.
 
-    Below it stands the expected calibration error of each kind of clouds.
+    Below it stands the expected calibration error of each kind of clouds, and what is said of
+    unrelated ones.
     """
     heads = ["verdict", "data", "pairs", "promised", "aligned", "wrong"]
     lines, summaries = markdown_head(heads), []
@@ -182,8 +184,8 @@ def confidence_table(results: Path) -> str:
             promised = np.concatenate([_confidence(result) for result in ours])
             aligned = np.concatenate([result.aligned for result in ours])
             both.append((promised, aligned))
-            verdicts = np.array([verdict(p, "").partition(":")[0] for p in promised])
-            for words in ("aligned", "probably aligned", "doubtful"):
+            verdicts = _verdicts(promised)
+            for words in _VERDICTS:
                 inside = verdicts == words
                 if inside.any():
                     means = [f"{values[inside].mean():.0%}" for values in (promised, aligned)]
@@ -195,6 +197,10 @@ def confidence_table(results: Path) -> str:
             error = expected_calibration_error(promised, aligned)
             text = f"expected calibration error over {_BINS} bins {error:.3f}"
             summaries += ["", f"{len(promised)} pairs of {what}: {text}."]
+        for unrelated in filter(None, (record.unrelated for record in records)):
+            verdicts = _verdicts(_confidence(unrelated)).tolist()
+            counts = ", ".join(f"{verdicts.count(words)} {words}" for words in _VERDICTS)
+            summaries += ["", f"{len(verdicts)} unrelated pairs of {what}: {counts}."]
     return "\n".join(lines + summaries)
 
 
@@ -280,6 +286,11 @@ def _read_comparisons(results: Path) -> list[Comparison]:
     records = map(read_comparison, (results / "register").glob("*-*-*.json"))
     kept = [record for record in records if record.protocol in _PROTOCOLS]
     return sorted(kept, key=lambda r: (_PROTOCOLS.index(r.protocol), r.data, r.points))
+
+
+def _verdicts(confidence: np.ndarray) -> np.ndarray:
+    """Return the verdicts (n,) of confidences (n,), without their reasons."""
+    return np.array([verdict(each, "").partition(":")[0] for each in confidence])
 
 
 def _confidence(result: ModelResult) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Train one arm with Lightning, and score it on the frozen test pairs."""
 
 import logging
+import pickle
 import statistics
 import time
 import warnings
@@ -180,7 +181,8 @@ def load_trained(arm: Arm, checkpoint: Path) -> Method:
         others = _other_options(arm, content.get("hyper_parameters", {}).get("network", {}))
         method.load_state_dict(content["state_dict"])
     except Exception as error:  # unpickling raises errors of every type
-        reason = others or short_message(error)
+        unsafe = isinstance(error, pickle.UnpicklingError)  # torch advises to load it all the same
+        reason = others or ("no checkpoint of tensors" if unsafe else short_message(error))
         raise CorrmatError(f"{checkpoint} does not fit these settings: {reason}") from error
     if others:
         log.warning(f"{checkpoint}: {others}")

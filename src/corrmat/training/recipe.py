@@ -372,7 +372,7 @@ def _read(path: Path) -> Settings:
         raise CorrmatError(f"no recipe {path}; see configs/exp/")
     try:
         content = yaml.safe_load(path.read_text())
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise CorrmatError(f"{path} is not YAML: {short_message(error)}") from error
     if not isinstance(content, dict):
         raise CorrmatError(f"{path} holds no settings")
