@@ -10,6 +10,7 @@ from corrmat.weights import shipped_metadata
 # Least confidence of the verdicts "aligned" and "probably aligned". `make calibration` says how
 # many of the held-out pairs are called "aligned" wrongly: about 2 % at most should be.
 SURE, LIKELY = 0.94, 0.5
+_LEAST_CORRELATION = 0.02  # unrelated clouds have some, too
 
 
 def verdict(confidence: float, reason: str) -> str:
@@ -23,9 +24,8 @@ def verdict(confidence: float, reason: str) -> str:
 class Calibration:
     """Logistic curves from the scores of a registration to the chance that it is right.
 
-    Coefficients are over (agreement, support, 1); over (agreement, support, coherence, phase
-    correlation, 1) for large clouds; and over (agreement, 1) for models without matches.
-    `registration.shipping.calibrate` fits them.
+    Coefficients are over (agreement, support, 1); over (`of_large_clouds`, 1) for large clouds; and
+    over (agreement, 1) for models without matches. `registration.shipping.calibrate` fits them.
     """
 
     both: list[float]
@@ -52,8 +52,18 @@ class Calibration:
         elif coherence is None or correlation is None:
             logit = np.dot(self.both, [agreement, support, 1.0])
         else:
-            logit = np.dot(self.large, [agreement, support, coherence, correlation, 1.0])
+            logit = np.dot(self.large, [*of_large_clouds(support, coherence, correlation), 1.0])
         return float(1 / (1 + np.exp(-logit)))
+
+
+def of_large_clouds(
+    support: float, coherence: float, correlation: float
+) -> tuple[float, float, float]:
+    """Bring the scores of two large clouds to numbers of order one for their curve.
+
+    Agreement is not among them: two rooms that have nothing in common agree well, too.
+    """
+    return support, 4 * coherence, float(np.log(max(correlation, _LEAST_CORRELATION)))
 
 
 def shipped_calibration() -> Calibration:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from corrmat import weights
-from corrmat.calibration import SURE, Calibration
+from corrmat.calibration import SURE, Calibration, of_large_clouds
 from corrmat.data.datamodule import RegistrationDataModule
 from corrmat.data.pairs import STREAM, Key, make_pairs
 from corrmat.errors import CorrmatError
@@ -24,7 +24,7 @@ from corrmat.types import PairBatch
 CALIBRATION_PAIRS = {512: 200, 1024: 100}  # of a protocol, by points of a cloud
 CALIBRATION_PROTOCOLS: tuple[benchmark.Protocol, ...] = ("real", "views", "clean")
 CALIBRATION_SCANS = 150  # pairs of each protocol of large clouds
-CALIBRATION_UNRELATED = 50  # such pairs whose clouds have nothing in common
+CALIBRATION_UNRELATED = 25  # such pairs whose clouds have nothing in common
 SCAN_POINTS = 20_000
 
 
@@ -102,9 +102,8 @@ def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:
         model: as `register` takes it.
 
     Returns:
-        Coefficients over (agreement, support, 1), of large clouds over (agreement, support,
-        coherence, phase correlation, 1), and over (agreement, 1); and the share of each protocol's
-        pairs of 512 points, and of large clouds, that are within 5 degrees.
+        The coefficients of a `Calibration`; and the share of each protocol's pairs of 512 points,
+        and of large clouds, that are within 5 degrees.
     """
     scores, aligned, recalls = [], [], {}
     agreements, aligned_alone = [], []
@@ -118,7 +117,8 @@ def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:
         for result in results.values():
             agreements += result.per_pair["agreement"]
             aligned_alone += result.aligned.tolist()
-    large_scores, large_aligned = [], []
+    large_scores: list[tuple[float, ...]] = []
+    large_aligned: list[bool] = []
     for protocol in benchmark.SCANS:
         pairs = benchmark.frozen_pairs(
             protocol, points=SCAN_POINTS, count=CALIBRATION_SCANS, split="val"
@@ -130,7 +130,10 @@ def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:
         large_aligned += [*result.aligned.tolist(), *[False] * len(strangers)]
     curve = Calibration(
         both=_fit_logistic(np.array(scores)[:, :2].astype(float), np.array(aligned, float)),
-        large=_fit_logistic(np.array(large_scores), np.array(large_aligned, float)),
+        large=_fit_logistic(
+            np.array([of_large_clouds(*each[1:]) for each in large_scores]),
+            np.array(large_aligned, float),
+        ),
         agreement=_fit_logistic(np.array(agreements)[:, None], np.array(aligned_alone, float)),
     )
     for of, right in ((scores, aligned), (large_scores, large_aligned)):
