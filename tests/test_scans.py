@@ -202,7 +202,7 @@ def _bytes_of(array):
         ("short.csv", b"x,y,z\n1,2\n", "row 1 holds 2 numbers"),
         ("hole.csv", b"x,y,z,i\n4,,6,9\n", "a coordinate of row 1 is empty"),
         ("noise.npy", b"\x93NUMPY nonsense", "cannot be read as NPY"),
-        ("noise.stl", b"solid nothing", "holds no points"),
+        ("noise.stl", b"solid nothing", "holds no points, or is cut short or no STL"),
         ("noise.pcd", b"VERSION .7\n", "cannot be read as PCD"),
         ("noise.glb", b"glTF....", "cannot be read as GLB"),
     ],

@@ -103,7 +103,8 @@ def read_shape(path: Path) -> "np.ndarray | trimesh.Trimesh":
         raise CorrmatError(f"{path} cannot be read as {kind[1:].upper()} ({reason})") from error
     points = points[~np.isnan(points).any(1)]
     if not len(points):
-        raise CorrmatError(f"{path} holds no points")
+        damaged = f", or is cut short or no {kind[1:].upper()}" if reader is _scene else ""
+        raise CorrmatError(f"{path} holds no points{damaged}")
     return points
 
 
