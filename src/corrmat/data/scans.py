@@ -293,7 +293,8 @@ def _text(path: Path) -> np.ndarray:
         raise CorrmatError(f"{path}: numbers like 1,5 need a decimal point")
     if lines[0].isdigit():  # the number of points, in XYZ files
         del lines[0]
-    separator = next((mark for mark in ";," if mark in "".join(lines[:2])), None)
+    sample = "".join(lines[1:2] or lines)  # a row, below the header if there is one
+    separator = next((mark for mark in ";," if mark in sample), None)
     columns = [0, 1, 2]
     first = _cells(lines[0].lstrip("/ "), separator) if lines else []
     if lines and not any(map(_is_number, first)):  # a header

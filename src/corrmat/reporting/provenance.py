@@ -88,8 +88,8 @@ def code_of(family: str, arms: Iterable[str]) -> list[str]:
     methods = [name for name in METHODS if name in arms or name.split("_")[0] == family]
     networks = {METHODS[name].network_type.__module__ for name in methods or METHODS}
     pending, reached = {*_ROOTS, *networks}, set[str]()
-    if nowhere := [module for module in pending if _path(module) is None]:
-        raise ModuleNotFoundError(f"{', '.join(sorted(nowhere))}: no such module")
+    if nowhere := [module for module in _ROOTS if _path(module) is None]:
+        raise ModuleNotFoundError(f"{', '.join(nowhere)}: no such module")
     while pending:
         module = pending.pop()
         path = _path(module)
