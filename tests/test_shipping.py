@@ -115,7 +115,7 @@ def test_the_verification_network_is_trained_goes_on_and_ships(package, tmp_path
     train_verification(**options)
     verification = load_verification(load_model())
     assert verification is not None
-    made = {path: path.stat().st_mtime_ns for path in (tmp_path / "runs").rglob("1-0.pt")}
+    made = {path: path.stat().st_mtime_ns for path in (tmp_path / "runs").rglob("1-0-6.pt")}
     assert len(made) == 1
     train_verification(**options)
     assert made == {path: path.stat().st_mtime_ns for path in made}
