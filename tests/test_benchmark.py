@@ -112,6 +112,9 @@ def test_calibration_intervals_and_paired_test_by_hand():
     promised = np.array([0.05, 0.05, 0.95, 0.95])
     error = comparisons.expected_calibration_error(promised, np.array([False, True, True, True]))
     assert error == pytest.approx((0.9 + 0.1) / 4)
+    # Two chances of a half: both right, or none, is an error of a half; else there is none.
+    assert comparisons.error_of_the_perfect(np.array([0.5, 0.5])) == (0, 0.5)
+    assert comparisons.error_of_the_perfect(np.ones(9)) == (0, 0)
     ours = np.array([True] * 9 + [False])
     assert comparisons._wilson(ours) == "60 to 98"
     theirs = np.array([True] * 3 + [False] * 6 + [True])

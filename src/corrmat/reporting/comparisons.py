@@ -23,6 +23,7 @@ _SMALL = "real", "views", "clean"  # clouds of at most 1,024 points
 _KINDS = {"small clouds": _SMALL, "dense scans of objects": ("dense",), "rooms": ("rooms",)}
 _VERDICTS = "aligned", "probably aligned", "doubtful"
 _BINS = 10  # of the expected calibration error
+_DRAWS = 1000  # of what chance alone makes of it
 
 
 class TrainingRun(TypedDict):
@@ -196,7 +197,9 @@ def confidence_table(results: Path) -> str:
             promised, aligned = map(np.concatenate, zip(*both, strict=True))
             error = expected_calibration_error(promised, aligned)
             text = f"expected calibration error over {_BINS} bins {error:.3f}"
-            summaries += ["", f"{len(promised)} pairs of {what}: {text}."]
+            low, high = error_of_the_perfect(promised)
+            perfect = f"a perfect confidence would show {low:.3f} to {high:.3f} on so many"
+            summaries += ["", f"{len(promised)} pairs of {what}: {text} ({perfect})."]
         for unrelated in filter(None, (record.unrelated for record in records)):
             verdicts = _verdicts(_confidence(unrelated)).tolist()
             counts = ", ".join(f"{verdicts.count(words)} {words}" for words in _VERDICTS)
@@ -214,6 +217,18 @@ def expected_calibration_error(promised: np.ndarray, happened: np.ndarray) -> fl
     bins = np.minimum((promised * _BINS).astype(int), _BINS - 1)
     gaps = [abs((promised - happened)[bins == b].sum()) for b in range(_BINS)]
     return float(sum(gaps) / len(promised))
+
+
+def error_of_the_perfect(promised: np.ndarray) -> tuple[float, float]:
+    """Compute the calibration error that chance alone gives chances (n,) which are all true.
+
+    Returns:
+        Its 90 % interval.
+    """
+    rng = np.random.default_rng(0)
+    drawn = rng.random((_DRAWS, len(promised))) < promised
+    low, high = np.percentile([expected_calibration_error(promised, d) for d in drawn], [5, 95])
+    return float(low), float(high)
 
 
 def doubling_summary(results: Path) -> str:
