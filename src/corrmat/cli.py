@@ -446,11 +446,11 @@ def _report(options: Namespace) -> int:
     if not read_records(results):
         raise CorrmatError(f"no records in {results}; run an experiment first")
     if output is not None:
-        from corrmat.reporting.page import build_page
-
         _refuse_folder(output)
         if not output.parent.is_dir():
             raise CorrmatError(f"no folder {output.parent} to write into")
+        from corrmat.reporting.page import build_page
+
         content = build_page(results)
         replace_text(output, content)
         print(f"{output}: {len(content) / 1e6:.1f} MB, open it in a browser")

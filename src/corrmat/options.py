@@ -123,10 +123,11 @@ def parse(words: Sequence[str]) -> Namespace:
         given = parser.parse_args(list(words), defaults=False) if command else Namespace()
     except argparse.ArgumentError as error:
         text = short_message(error)
-        known = bool(words) and not words[0].startswith("-") and "argument command" not in text
-        name = words[0] if known else ""
-        text = text.replace(f"{name}.", "") if known else text  # "register.source"
-        raise CorrmatError(f"{text}; see {f'corrmat {name}'.strip()} --help") from error
+        name = "corrmat"
+        if words and not words[0].startswith("-") and "argument command" not in text:
+            name += f" {words[0]}"
+            text = text.replace(f"{words[0]}.", "")  # "register.source"
+        raise CorrmatError(f"{text}; see {name} --help") from error
     options = parsed[parsed.command]
     options.command = parsed.command
     if command:

@@ -67,9 +67,8 @@ def correlation_of_large(
 
     Where one is small, it finds candidates, but says little of how good they are.
     """
-    if len(scorers) == 1 or min(len(scorers[1].source), len(scorers[1].target)) <= LEVELS[0]:
-        return None
-    return phase_correlation(hypotheses, scorers)
+    fewest = min(len(scorers[-1].source), len(scorers[-1].target))
+    return phase_correlation(hypotheses, scorers) if fewest > LEVELS[0] else None
 
 
 def weights_for(hypotheses: Hypotheses, scorers: Sequence[AlignmentScorer]) -> ChoiceWeights:

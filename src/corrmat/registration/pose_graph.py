@@ -29,8 +29,7 @@ class ScanPose:
     """The pose of one of several scans."""
 
     transform: np.ndarray  # (4, 4) float64, T_target_scan, in the scans' own units
-    confidence: float  # of the weakest registration on the surest way to the target; low if most
-    # registrations of this scan do not agree with the poses
+    confidence: float  # of the weakest registration on the surest way; low if most disagree
     agree: int  # registrations of this scan that agree with the poses
     verdict: str  # as of a `Registration`
 

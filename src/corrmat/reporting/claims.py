@@ -77,11 +77,6 @@ class Evidence:
         """Errors of METHOD_corr."""
         return self.errors[self.record.treatment]
 
-    @property
-    def where(self) -> str:
-        """See `Record.trained_on`."""
-        return self.record.trained_on
-
     def left_identity(self, errors: PairErrors) -> bool:
         """Tell whether an arm is clearly better than guessing the identity."""
         return errors.median_deg < LEFT_IDENTITY * self.identity_median_deg
@@ -134,7 +129,7 @@ def less_error(evidence: Evidence) -> Claim:
         f"{record.id}: {record.treatment} registers better than {record.baseline} ({record.title})",
         f"{theirs[0]:.3g} → {theirs[1]:.3g} deg: {paper_ratio:.3g} times" if paper_ratio else "",
         ours,
-        evidence.where,
+        evidence.record.trained_on,
         verdict_of_ratio(ratio, paper_ratio, learnt),
         "registers better",
     )
@@ -197,7 +192,7 @@ def sooner(evidence: Evidence) -> Claim | None:
         f"{record.id}: {record.treatment} converges sooner",
         "half the epochs (1.1)",
         f"{goal_text} of {baseline.pairs_seen:,} pairs: reached {reached}{best_at_high_rate}",
-        evidence.where,
+        evidence.record.trained_on,
         verdict,
         "converges sooner",
     )
@@ -219,7 +214,7 @@ def flat_over_misalignment(evidence: Evidence) -> Claim:
         "0.005 to 0.010 deg: 2 times",
         f"median {first_band.median_deg:.2g} deg in the first band, {last_band.median_deg:.2g} in "
         f"the last: {as_text(growth)} times",
-        evidence.where,
+        evidence.record.trained_on,
         verdict,
     )
 
@@ -242,7 +237,7 @@ def lower_in_every_band(evidence: Evidence) -> Claim:
         "2.4: RPMNet_corr's error is lower in every band (table 2)",
         "6 of 6 bands",
         f"clearly lower in {better} of {len(ratios)} bands, higher in {worse}",
-        evidence.where,
+        evidence.record.trained_on,
         verdict,
     )
 
@@ -259,7 +254,7 @@ def loss_not_rate(evidence: Evidence) -> Claim | None:
         "(RPMNet was unstable at high rates)",
         f"{as_text(median_rotation(evidence.errors[control]), 'deg')} → "
         f"{as_text(median_rotation(evidence.treatment), 'deg')}: {as_text(ratio)} times",
-        evidence.where,
+        evidence.record.trained_on,
         verdict_of_ratio(ratio, None, evidence.left_identity(evidence.errors[control])),
     )
 
@@ -280,7 +275,7 @@ def unstable_at_high_rates(evidence: Evidence) -> Claim | None:
         "trained at 1e-4 for that reason",
         f"steady 1e-4 to one cycle at a high rate: median error falls {as_text(ratio)} times, "
         f"worst validation {worst:.3g} deg",
-        evidence.where,
+        evidence.record.trained_on,
         verdict,
     )
 
@@ -298,7 +293,7 @@ def matches_say_more(evidence: Evidence) -> Claim | None:
         f"{evidence.record.id}: matches tell networks apart that degrees do not",
         "28.9 % → 99.7 %, 0.56 → 0.059 deg",
         f"{as_text(fewer, '%')} → {as_text(more, '%')}; medians {as_text(ratio)} times apart",
-        evidence.where,
+        evidence.record.trained_on,
         "confirmed" if alike and apart else "not shown",
     )
 
@@ -323,7 +318,7 @@ def below_seventy_per_cent(evidence: Evidence) -> Claim | None:
         "63 %",
         f"{as_text(share, '%')} after {record.arms[record.treatment].pairs_seen:,} pairs, "
         f"{100 * gain:.2g} points of them in the last quarter",
-        evidence.where,
+        evidence.record.trained_on,
         verdict,
     )
 
