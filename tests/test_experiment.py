@@ -692,6 +692,15 @@ def test_a_cycle_that_would_rise_in_one_step_is_refused_before_anything_is_delet
         prepare(load("1.1", *options, "--optimizer.warmup", "0.2").arms["DCP"])
 
 
+def test_batch_norms_keep_their_statistics_from_a_share_of_the_run_on(tmp_path):
+    """Two of eight steps follow the batches, of two clouds each; a validation lies between."""
+    settings = load("1.2", "--optimizer.freeze_norms", "0.25").arms["DCP_corr"]
+    trained = train(settings, tmp_path)
+    state = torch.load(trained.checkpoint.with_name("last.ckpt"), weights_only=True)["state_dict"]
+    tracked = {int(n) for name, n in state.items() if name.endswith("num_batches_tracked")}
+    assert tracked == {2 * 2}
+
+
 def test_checkpoints_reload_to_the_same_network(tmp_path):
     settings = load("1.1").arms["DCP_corr"]
     trained = train(settings, tmp_path / "run")

@@ -25,6 +25,8 @@ class OptimizerSettings:
         milestones: epochs.
         gamma: factor.
         warmup: share of a one-cycle run in which the rate rises.
+        freeze_norms: share of the run after which batch norms no longer follow their batches but
+            use their running statistics, as in a test. 1 is never, as in the paper.
     """
 
     lr: float = 1e-3
@@ -33,6 +35,7 @@ class OptimizerSettings:
     milestones: tuple[int, ...] = (25, 50, 100, 150, 200)
     gamma: float = 0.25
     warmup: float = 0.1
+    freeze_norms: float = 1.0
 
     def __post_init__(self) -> None:
         check_choices(self)
@@ -41,6 +44,7 @@ class OptimizerSettings:
             "weight_decay": self.weight_decay >= 0,
             "gamma": self.gamma > 0,
             "warmup": 0 < self.warmup < 1,
+            "freeze_norms": 0 <= self.freeze_norms <= 1,
         }
         for name, valid in checks.items():
             if not valid:
@@ -73,6 +77,14 @@ class RegistrationModule(L.LightningModule):
     def forward(self, source: Tensor, target: Tensor) -> Prediction:
         """Predict the transforms of source (B, N, C) onto target (B, M, C)."""
         return self.network(source, target)
+
+    def on_train_batch_start(self, batch: PairBatch, batch_index: int) -> None:
+        """Freeze the statistics of the batch norms from a share of the run on."""
+        freeze_at = self.optimizer_settings.freeze_norms * self.trainer.estimated_stepping_batches
+        if self.global_step >= freeze_at:
+            for module in self.modules():
+                if isinstance(module, nn.BatchNorm1d):
+                    module.eval()
 
     def training_step(self, batch: PairBatch, batch_index: int) -> Tensor:
         """Compute the loss of a batch; log it and the correct matches where Lightning logs.
