@@ -63,9 +63,14 @@ def test_the_fused_edge_mlp_equals_the_plain_layers(training):
         torch.testing.assert_close(fused, plain, rtol=1e-9, atol=1e-10)
 
 
-def test_dgcnn_gives_the_same_with_and_without_the_fused_kernel(monkeypatch, generator):
+@pytest.mark.parametrize("frozen", [False, True])
+def test_dgcnn_gives_the_same_with_and_without_the_fused_kernel(monkeypatch, generator, frozen):
+    """In training too, and where only the statistics of its norms are frozen."""
     torch.manual_seed(0)
     network = DGCNN(16, (8, 8, 12, 16), 5).double()
+    for norm in (network.norm, *(layer.norm for layer in network.edge)):
+        norm.train(not frozen)
+        norm.running_mean.fill_(0.1)
     points = torch.randn(2, 30, 3, dtype=torch.float64, generator=generator)
     results = []
     for fewest in (0, 10**9):

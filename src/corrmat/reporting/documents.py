@@ -157,6 +157,24 @@ def low_rate_table(results: Path) -> str:
     return "\n".join(lines)
 
 
+def batch_norm_table(results: Path) -> str:
+    """Build the table of DCP's arms under running statistics and under those of each batch."""
+    heads = ["record", "pairs", "arm", "statistics frozen", "tested with", "median, deg", "matches"]
+    lines = markdown_head(heads)
+    path = results / "batch_norm.json"
+    tests = json.loads(path.read_text()) if path.is_file() else {}
+    for name, rows in sorted(tests.items()):
+        for row in rows:
+            share = row["freeze_norms"]
+            frozen = "never" if share == 1 else f"after {share:.0%}"
+            for statistics, said in (("running", "running statistics"), ("batch", "each batch's")):
+                degrees = as_text(Estimate(**row[statistics]["median_deg"]))
+                matches = as_text(Estimate(**row[statistics]["match_accuracy"]), "%")
+                cells = [name, f"{row['pairs_seen']:,}", row["arm"], frozen, said, degrees, matches]
+                lines.append(markdown_row(cells))
+    return "\n".join(lines)
+
+
 def weights_table(records: Sequence[Record]) -> str:
     """Build the table of the trained arms that ship: names for `load_model`, and their records."""
     lines = markdown_head(["name", "record", "training pairs", "correct matches, %"])
@@ -244,6 +262,7 @@ TABLES: tuple[tuple[str, str, Callable[[Results], str]], ...] = (
     ("docs/reproduction.md", "rates", lambda results: rates_table(results.folder)),
     ("docs/reproduction.md", "slack", lambda results: slack_table(results.folder)),
     ("docs/reproduction.md", "low_rate", lambda results: low_rate_table(results.folder)),
+    ("docs/reproduction.md", "batch_norm", lambda results: batch_norm_table(results.folder)),
     ("docs/reproduction.md", "weights", lambda results: weights_table(results.records)),
     ("docs/reproduction.md", "seeds", lambda results: seeds_table(results.folder)),
     ("docs/metrics.md", "tables", lambda results: markdown_tables(results.records)),
