@@ -701,6 +701,22 @@ def test_batch_norms_keep_their_statistics_from_a_share_of_the_run_on(tmp_path):
     assert tracked == {2 * 2}
 
 
+def test_denormal_numbers_are_zero_in_training_and_nowhere_else(tmp_path, monkeypatch):
+    def tiny():
+        return float(torch.tensor(1e-39) * 1)
+
+    seen, step = [], RegistrationModule.training_step
+
+    def training_step(self, *args):
+        seen.append(tiny())
+        return step(self, *args)
+
+    monkeypatch.setattr(RegistrationModule, "training_step", training_step)
+    train(load("1.2", "--trainer.max_steps", "2").arms["DCP"], tmp_path)
+    assert seen == [0.0, 0.0]
+    assert tiny() > 0
+
+
 def test_checkpoints_reload_to_the_same_network(tmp_path):
     settings = load("1.1").arms["DCP_corr"]
     trained = train(settings, tmp_path / "run")

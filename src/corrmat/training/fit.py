@@ -28,6 +28,7 @@ from corrmat.training.console import Board, BoardProgress
 from corrmat.training.hardware import (
     describe_hardware,
     first_device,
+    flush_denormals,
     is_first_process,
     keep_freed_memory,
     on_gpu,
@@ -102,7 +103,8 @@ def train(
     if resume_from is not None:
         log.info(f"continuing from {resume_from}")
     try:
-        trainer.fit(method, arm.datamodule, ckpt_path=resume_from, weights_only=True)
+        with flush_denormals():
+            trainer.fit(method, arm.datamodule, ckpt_path=resume_from, weights_only=True)
     except BrokenPipeError:  # whoever read our output has gone
         raise
     except (CorrmatError, OSError) as error:

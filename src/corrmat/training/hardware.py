@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+from collections.abc import Iterator
 
 import torch
 from lightning.pytorch.plugins.precision import MixedPrecision, Precision
@@ -107,6 +108,19 @@ def keep_freed_memory() -> None:
         library = ctypes.CDLL(None)
         library.mallopt(_M_MMAP_MAX, 0)
         library.mallopt(_M_TRIM_THRESHOLD, -1)  # never
+
+
+@contextlib.contextmanager
+def flush_denormals() -> Iterator[None]:
+    """Let numbers below 1e-38 be zero: many CPUs compute with them a hundred times slower.
+
+    DCP's attention makes them where it is sharp, and a step then takes twice the time.
+    """
+    torch.set_flush_denormal(True)
+    try:
+        yield
+    finally:
+        torch.set_flush_denormal(False)
 
 
 def is_first_process() -> bool:
