@@ -75,6 +75,7 @@ def main(name: str, model: str, data: str, root: str | None = None) -> None:
         data: to test on.
         root: folder of the data set.
     """
+    today = commit()
     network = load_model(model).eval()
     assert isinstance(network, RPMNetwork)
     overrides = {"data": {"data": data, "root": root}}
@@ -93,7 +94,7 @@ def main(name: str, model: str, data: str, root: str | None = None) -> None:
         rows["its own" if alpha is None else str(alpha)] = dict(zip(keys, medians, strict=True))
         print(f"{name}, alpha {alpha}: {medians}", flush=True)
     content = json.loads(PATH.read_text()) if PATH.is_file() else {}
-    content[name] = {"commit": commit(), "pairs": len(errors), "alpha": rows}
+    content[name] = {"commit": today, "pairs": len(errors), "alpha": rows}
     replace_text(PATH, json.dumps(content, indent=1) + "\n")
 
 

@@ -14,6 +14,7 @@ import shutil
 import signal
 import socket
 import sys
+import types
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from corrmat import weights
 from corrmat.baselines import is_available
-from corrmat.errors import CorrmatError
+from corrmat.errors import CorrmatError, DivergedError
 from corrmat.metrics import rotation_error_deg
 from corrmat.module import RegistrationModule
 from corrmat.registration import benchmark
@@ -425,6 +426,9 @@ def test_nothing_is_deleted_or_trained_when_the_test_split_cannot_be_read(tmp_pa
         ("--trainer.devices 5", "cannot share 4 held-out shapes"),
         ("--trainer.devices 2 --trainer.val_check_interval 6 --trainer.check_val_every_n_epoch 1",
          "never comes in epochs of 4 batches"),
+        ("--trainer.limit_train_batches 3 --trainer.val_check_interval 5 "
+         "--trainer.check_val_every_n_epoch 1", "never comes in epochs of 3 batches"),
+        ("--data.train_shapes 4 --trainer.devices 8", "cannot share"),
         ("--trainer.precision 16-mixed", "cannot clip"),
     ):  # fmt: skip
         changed = load("1.1", *words.split(), arms=["DCP"])
@@ -715,6 +719,20 @@ def test_denormal_numbers_are_zero_in_training_and_nowhere_else(tmp_path, monkey
     train(load("1.2", "--trainer.max_steps", "2").arms["DCP"], tmp_path)
     assert seen == [0.0, 0.0]
     assert tiny() > 0
+
+
+def test_an_interrupted_run_keeps_no_weights_that_are_not_finite(tmp_path, monkeypatch):
+    """On a GPU the loss is not looked at in every step."""
+    method = fit.fresh_method(load("1.2").arms["DCP_corr"])
+    method._last_loss = torch.tensor(math.nan)
+    monkeypatch.setattr(RegistrationModule, "global_step", 7)
+    monkeypatch.setattr(RegistrationModule, "current_epoch", 0)
+    monkeypatch.setattr(callbacks, "_validation_follows", lambda *_: False)
+    interrupt = callbacks.SaveOnInterrupt(tmp_path / "last.ckpt")
+    interrupt.stop_requested = True
+    trainer = types.SimpleNamespace(accumulate_grad_batches=1, world_size=1, loggers=[])
+    with pytest.raises(DivergedError, match="at step 7"):
+        interrupt.on_train_batch_end(trainer, method, None, None, 0)
 
 
 def test_checkpoints_reload_to_the_same_network(tmp_path):

@@ -1,6 +1,7 @@
 """Several scans onto one."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from corrmat.data.scans import read_scan, write_ply
 from corrmat.data.shapes.dataset import make_shape
 from corrmat.errors import CorrmatError
 from corrmat.registration import pose_graph
-from corrmat.registration.pose_graph import register_scans
+from corrmat.registration.pose_graph import ScanPose, register_scans, to_text
 from corrmat.registration.preparation import Cloud
 
 
@@ -126,6 +127,13 @@ def test_the_command_moves_every_scan_onto_the_last(tmp_path, monkeypatch, capsy
         assert off(np.array(scan["transform"]), truth, original) < 0.1
         moved = read_scan(tmp_path / "moved" / scan["scan"])
         assert np.abs(moved - (original @ truth[:3, :3].T + truth[:3, 3])).max() < 0.1
+
+
+@pytest.mark.parametrize(("model", "said"), [("corrmat", False), ("icp", True)])
+def test_a_confidence_that_is_not_fitted_to_the_model_is_marked(model, said):
+    pose = ScanPose(np.eye(4), 0.95, 1, "aligned")
+    text = to_text([Path("a.ply")], Path("b.ply"), [pose], model)
+    assert ("not to this model" in text) == said
 
 
 @pytest.mark.parametrize(

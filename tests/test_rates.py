@@ -60,8 +60,7 @@ def rate(lr, error):
 
 def test_a_rate_that_diverged_is_not_chosen():
     assert rates.chosen([rate(1.0, None), rate(2.0, 5.0), rate(3.0, 9.0)]) == 2.0
-    with pytest.raises(CorrmatError, match="diverged at every rate: 1.0, 2.0"):
-        rates.chosen([rate(1.0, None), rate(2.0, None)])
+    assert rates.chosen([rate(1.0, None), rate(2.0, None)]) is None
 
 
 def test_a_rate_that_diverges_does_not_end_the_sweep(tmp_path, monkeypatch):
@@ -79,6 +78,22 @@ def test_a_rate_that_diverges_does_not_end_the_sweep(tmp_path, monkeypatch):
     assert arm["chosen"] == 0.00067
     assert [each["rotation_error_deg_mean"] for each in arm["rates"]] == [0.00067, 0.002, None]
     assert "0.006: diverged" in documents.rates_table(tmp_path / "results")
+
+
+def test_an_arm_that_diverges_at_every_rate_costs_no_other_its_record(tmp_path, monkeypatch):
+    def diverge(recipe, arm, *others, **options):
+        if arm.name.startswith("DCP_corr"):
+            raise DivergedError("the loss is nan")
+        curve = [{"rotation_error_deg_mean": 1.0, "loss": 1.0}]
+        return TrainedArm(tmp_path, 48, 1.0, None, curve)
+
+    monkeypatch.setattr(rates, "train_or_reuse", diverge)
+    with pytest.raises(CorrmatError, match="DCP_corr: training diverged at every rate: 0.00067"):
+        rates.sweep(load("1.2", "smoke"), tmp_path / "results", tmp_path / "runs")
+    arms = json.loads((tmp_path / "results/rates/smoke/shapes/1.2.json").read_text())["arms"]
+    assert arms["DCP"]["chosen"] == 0.00067
+    assert arms["DCP_corr"]["chosen"] is None
+    assert "diverged" in documents.rates_table(tmp_path / "results")
 
 
 def test_a_budget_in_epochs_has_no_twentieth(tmp_path):

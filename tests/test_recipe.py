@@ -8,6 +8,8 @@ from corrmat.data.pairs import PairSettings
 from corrmat.errors import CorrmatError
 from corrmat.methods import METHODS
 from corrmat.module import OptimizerSettings
+from corrmat.networks.dcp import DCPNetwork
+from corrmat.networks.rpmnet import RPMNetwork
 from corrmat.training import recipe
 from corrmat.training.experiment import bands
 from corrmat.training.hardware import trainer_options
@@ -243,6 +245,16 @@ def test_epochs_on_the_command_line_overrule_the_recipes_steps():
     assert (trainer.max_epochs, trainer.max_steps) == (5, -1)
 
 
+def test_an_option_that_one_arm_has_not_is_for_the_others():
+    arms = load("3.2", "smoke", "--network.iterations", "3").arms
+    assert arms["PCRNet"].network.iterations == 3
+    assert "iterations" not in arms["PCRNet_corr"].network
+    arms = load("2.1", "smoke", "--loss.inlier_weight", "0.1").arms
+    assert arms["RPMNet"].loss.inlier_weight == 0.1
+    with pytest.raises(CorrmatError, match="iterations"):
+        load("1.2", "smoke", "--network.iterations", "3")
+
+
 def test_precision_stands_in_the_recipe():
     settings = load("1.1", "paper").arms["DCP"]
     assert settings.trainer.precision == "auto"
@@ -279,6 +291,9 @@ def test_a_base_may_have_a_base(tmp_path):
         (lambda: PairSettings(sampling="identicall"), "sampling = 'identicall'; choices: ident"),
         (lambda: PairSettings(corrupted="target"), "corrupted = 'target'; choices: source, both"),
         (lambda: OptimizerSettings(schedule="cosine"), "schedule = 'cosine'; choices: step"),
+        (lambda: DCPNetwork(pointer="Transformer"), "pointer = 'Transformer'; choices: transf"),
+        (lambda: DCPNetwork(outlier="dust"), "outlier = 'dust'; choices: none, least_squares"),
+        (lambda: RPMNetwork(slack="rows"), "slack = 'rows'; choices: row, both, none"),
     ],
 )
 def test_a_misspelt_choice_is_refused_in_python_too(build, message):

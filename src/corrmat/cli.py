@@ -161,7 +161,7 @@ def _fit(options: Namespace) -> int:
     """Train one arm."""
     loaded = _load_arm(options)
     from corrmat.files import ensure_writable
-    from corrmat.training import console, experiment, preflight
+    from corrmat.training import console, experiment, hardware, preflight
 
     arm = preflight.prepare(loaded.arms[loaded.treatment])
     ensure_writable(options.runs / loaded.place / arm.name)
@@ -169,7 +169,8 @@ def _fit(options: Namespace) -> int:
         trained = experiment.train_or_reuse(
             loaded, arm, options.runs, options.logger, board, fresh=options.fresh
         )
-    print(f"best checkpoint: {trained.checkpoint}")
+    if hardware.is_first_process():
+        print(f"best checkpoint: {trained.checkpoint}")
     return 0
 
 
@@ -353,7 +354,7 @@ def _register_several(options: Namespace) -> int:
     poses = pose_graph.register_scans(
         scans, model=options.model, refine=options.refine, seed=options.seed
     )
-    print(pose_graph.to_text(options.source, options.target, poses))
+    print(pose_graph.to_text(options.source, options.target, poses, options.model))
     if options.output is not None:
         options.output.mkdir(parents=True, exist_ok=True)
         for path, scan, pose in zip(_moved_files(options), options.source, poses, strict=True):

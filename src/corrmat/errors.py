@@ -4,6 +4,7 @@ import dataclasses
 import re
 import textwrap
 import typing
+from collections.abc import Collection
 
 
 class CorrmatError(Exception):
@@ -34,6 +35,16 @@ def require_positive(**sizes: int) -> None:
             raise CorrmatError(f"{name} {size} is not positive")
 
 
+def require_choice(name: str, value: object, choices: Collection[object]) -> None:
+    """Check a value against its choices.
+
+    Raises:
+        CorrmatError: it is none of them; the message names them.
+    """
+    if value not in choices:
+        raise CorrmatError(f"{name} = {value!r}; choices: {', '.join(map(str, choices))}")
+
+
 def check_choices(settings: object) -> None:
     """Check the fields of a dataclass whose type is a Literal, which Python itself does not.
 
@@ -42,7 +53,6 @@ def check_choices(settings: object) -> None:
     """
     hints = typing.get_type_hints(type(settings))
     for field in dataclasses.fields(settings):  # pyright: ignore[reportArgumentType]
-        choices = typing.get_args(hints[field.name])
-        value = getattr(settings, field.name)
-        if typing.get_origin(hints[field.name]) is typing.Literal and value not in choices:
-            raise CorrmatError(f"{field.name} = {value!r}; choices: {', '.join(choices)}")
+        if typing.get_origin(hints[field.name]) is typing.Literal:
+            choices = typing.get_args(hints[field.name])
+            require_choice(field.name, getattr(settings, field.name), choices)

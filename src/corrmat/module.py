@@ -98,7 +98,7 @@ class RegistrationModule(L.LightningModule):
         self._last_loss = loss.detach()
         is_logged = self._is_logged_step()
         if is_logged or loss.device.type == "cpu":
-            self._require_finite_loss(f"batch {batch_index}, shapes {batch.shape.tolist()}")
+            self.require_finite_loss(f"batch {batch_index}, shapes {batch.shape.tolist()}")
         self.log("train/loss", loss, prog_bar=True, batch_size=len(batch))
         if is_logged and prediction.correspondence is not None:
             predicted = prediction.correspondence.argmax()
@@ -111,7 +111,7 @@ class RegistrationModule(L.LightningModule):
         every = getattr(self._trainer, "log_every_n_steps", 1)
         return every < 2 or (self.global_step + 1) % every == 0
 
-    def _require_finite_loss(self, where: str) -> None:
+    def require_finite_loss(self, where: str) -> None:
         """Reject a last loss that is not finite."""
         if self._last_loss is not None and not torch.isfinite(self._last_loss):
             raise DivergedError(
@@ -121,7 +121,7 @@ class RegistrationModule(L.LightningModule):
 
     def on_validation_start(self) -> None:
         """Check the last loss, so that no checkpoint keeps weights that are not finite."""
-        self._require_finite_loss("before validation")
+        self.require_finite_loss("before validation")
 
     def validation_step(self, batch: PairBatch, batch_index: int) -> None:
         """Collect the predictions of a batch."""

@@ -4,6 +4,7 @@ from typing import Literal
 
 from torch import Tensor, nn
 
+from corrmat.errors import require_choice
 from corrmat.networks.attention import Transformer
 from corrmat.networks.dgcnn import DGCNN
 from corrmat.networks.matching import MATCHING_HEADS, Outlier
@@ -37,6 +38,8 @@ class DCPNetwork(nn.Module):
         outlier: Outlier = "none",
     ) -> None:
         super().__init__()
+        require_choice("pointer", pointer, ("transformer", "identity"))
+        require_choice("outlier", outlier, MATCHING_HEADS)
         self.min_points = k
         self.embed = DGCNN(width, edge_channels, k)
         self.pointer = Transformer(width, heads, feedforward) if pointer == "transformer" else None

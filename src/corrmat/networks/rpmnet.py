@@ -1,12 +1,13 @@
 """RPM-Net (Yew & Lee, CVPR 2020), the network of experiments 2.1 to 2.4."""
 
 from functools import partial
+from typing import get_args
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from corrmat.errors import CorrmatError, require_positive
+from corrmat.errors import CorrmatError, require_choice, require_positive
 from corrmat.networks.pointnet import shared_mlp
 from corrmat.networks.ppf import Neighborhoods, neighborhoods
 from corrmat.ops import rigid
@@ -52,6 +53,7 @@ class RPMNetwork(nn.Module):
         for name, size, groups in ("width", width, 8), ("annealing_width", annealing_width, 16):
             if size < groups or size % groups:
                 raise CorrmatError(f"{name} {size} is not a multiple of {groups} groups")
+        require_choice("slack", slack, get_args(Slack))
         require_positive(
             k=k, iterations=iterations, test_iterations=test_iterations,
             sinkhorn_iterations=sinkhorn_iterations,

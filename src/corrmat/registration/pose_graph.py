@@ -16,7 +16,7 @@ from corrmat.errors import CorrmatError
 from corrmat.ops import rigid
 from corrmat.registration.preparation import Cloud
 from corrmat.registration.register import DOUBTFUL, Refine, register
-from corrmat.registration.result import matrix_lines
+from corrmat.registration.result import matrix_lines, note_on_confidence
 
 _SWEEPS = 50  # of averaging; poses settle within ten
 # How far a registration may be off the poses to agree with them: in degrees, and as a share of the
@@ -74,11 +74,12 @@ def register_scans(
     return [graph.pose(index) for index in range(len(scans) - 1)]
 
 
-def to_text(paths: Sequence[Path], target: Path, poses: Sequence[ScanPose]) -> str:
+def to_text(paths: Sequence[Path], target: Path, poses: Sequence[ScanPose], model: str) -> str:
     """Format poses for people."""
+    note = note_on_confidence(model)
     lines = [f"every scan onto {target} (target = matrix @ scan):"]
     for path, pose in zip(paths, poses, strict=True):
-        lines.append(f"{path}: {pose.verdict}, confidence {pose.confidence:.0%}")
+        lines.append(f"{path}: {pose.verdict}, confidence {pose.confidence:.0%}{note}")
         lines += matrix_lines(pose.transform)
     return "\n".join(lines)
 

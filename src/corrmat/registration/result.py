@@ -47,14 +47,17 @@ def to_text(registration: Registration) -> str:
     if len(registration.matches):
         agree, matches = registration.match_agrees.sum(), len(registration.matches)
         lines.append(f"matches      {agree} of {matches} agree with the transform")
-    fitted = registration.model == "corrmat"
-    note = "" if fitted else "  (fitted to the shipped weights, not to this model)"
     lines += [
-        f"confidence   {registration.confidence:.0%}{note}",
+        f"confidence   {registration.confidence:.0%}{note_on_confidence(registration.model)}",
         f"verdict      {registration.verdict}",
     ]
     lines.append(f"({registration.model}, seed {registration.seed}, {registration.seconds:.2f} s)")
     return "\n".join(filter(None, lines))
+
+
+def note_on_confidence(model: str) -> str:
+    """Say what a model's confidence was not fitted to; nothing of the shipped weights."""
+    return "" if model == "corrmat" else "  (fitted to the shipped weights, not to this model)"
 
 
 def matrix_lines(transform: np.ndarray) -> list[str]:

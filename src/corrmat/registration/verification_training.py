@@ -79,7 +79,7 @@ def train_verification(
         seed: of the pairs and of the network.
         workers: processes that make candidates; 0 makes them in this one.
     """
-    verified = weights.checksum(weights.load_model())
+    today, verified = commit(), weights.checksum(weights.load_model())
     folder = runs / f"verification-{verified}" / data
     count = min(pairs, SHARD_PAIRS)
     shards = {n: folder / f"{seed}-{n}-{count}.pt" for n in range(-(-pairs // SHARD_PAIRS))}
@@ -115,7 +115,7 @@ def train_verification(
     trainer.fit(module, loader, ckpt_path=last if last.is_file() else None)
     path = weights.ship_network(
         "verification", "verification", {}, module.network,
-        verifies=verified, pairs=str(len(useful)), seed=str(seed), commit=str(commit()),
+        verifies=verified, pairs=str(len(useful)), seed=str(seed), commit=str(today),
     )  # fmt: skip
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
     recalibrate()

@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import cast
 
@@ -154,7 +154,7 @@ class Record:
 
     def to_json(self) -> dict[str, object]:
         """Return the dictionary of metrics.json."""
-        content: dict[str, object] = {name: getattr(self, name) for name in self.__annotations__}
+        content: dict[str, object] = {f.name: getattr(self, f.name) for f in fields(self)}
         for group in ("arms", "baselines", "paper"):
             content[group] = {name: r.to_json() for name, r in getattr(self, group).items()}
         return content
@@ -162,11 +162,11 @@ class Record:
     @staticmethod
     def from_json(content: Mapping[str, object]) -> "Record":
         """Read the dictionary of metrics.json."""
-        fields = {name: content.get(name) for name in Record.__annotations__}
+        values = {field.name: content.get(field.name) for field in fields(Record)}
         for group in ("arms", "baselines", "paper"):
-            results = cast("Mapping[str, Json]", fields[group] or {})
-            fields[group] = {name: ArmResult.from_json(r) for name, r in results.items()}
-        return Record(**fields)  # pyright: ignore[reportArgumentType] (our own file)
+            results = cast("Mapping[str, Json]", values[group] or {})
+            values[group] = {name: ArmResult.from_json(r) for name, r in results.items()}
+        return Record(**values)  # pyright: ignore[reportArgumentType] (our own file)
 
 
 COMMIT_SEPARATOR = " / "  # between the commits of an arm that was trained by more than one

@@ -214,6 +214,8 @@ class SaveOnInterrupt(Callback):
         whole_step = (batch_idx + 1) % trainer.accumulate_grad_batches == 0
         if self.stop_requested and whole_step and not _validation_follows(trainer, batch_idx):
             if trainer.world_size == 1:
+                assert isinstance(pl_module, RegistrationModule)
+                pl_module.require_finite_loss("in the last step")
                 trainer.save_checkpoint(self.path)
             for logger in trainer.loggers:
                 logger.save()

@@ -50,6 +50,7 @@ def prepare(settings: ArmSettings) -> Arm:
             f"{required}; raise --data.num_points or lower --network.k"
         )
     datamodule.setup()
+    _check_processes(arm)
     _check_optimization(arm)
     _check_validation(arm)
     _try_one_batch(method, arm)
@@ -107,6 +108,16 @@ def _processes(arm: Arm) -> int:
     return max(1, count_devices(trainer.devices)) * trainer.num_nodes  # 0: Lightning counts them
 
 
+def _check_processes(arm: Arm) -> None:
+    """Reject more processes than there are shapes for each to validate on."""
+    processes, held_out = _processes(arm), len(arm.datamodule.clouds("val"))
+    if processes > held_out:
+        raise CorrmatError(
+            f"{processes} processes cannot share {held_out} held-out shapes: lower "
+            "--trainer.devices, or raise --data.train_shapes"
+        )
+
+
 def _check_optimization(arm: Arm) -> None:
     """Reject optimizer settings that Lightning would only fail on after training has started."""
     trainer, optimizer = arm.settings.trainer, arm.settings.optimizer
@@ -149,18 +160,11 @@ def _check_optimization(arm: Arm) -> None:
 
 def _check_validation(arm: Arm) -> None:
     """Reject validation that never comes, or that would save checkpoints within a step."""
-    trainer, data = arm.settings.trainer, arm.datamodule
-    processes = _processes(arm)
-    held_out = len(data.clouds("val"))
-    if processes > held_out:
-        raise CorrmatError(
-            f"{processes} processes cannot share {held_out} held-out shapes: lower "
-            "--trainer.devices, or raise --data.train_shapes"
-        )
+    trainer = arm.settings.trainer
     accumulate, interval = trainer.accumulate_grad_batches, trainer.val_check_interval
     if not isinstance(interval, int | float | None):
         raise CorrmatError(f"--trainer.val_check_interval {interval} is not a number of batches")
-    batches = _train_batches(arm)
+    batches = _limited(_train_batches(arm), trainer.limit_train_batches)
     if trainer.check_val_every_n_epoch is not None and interval is not None:
         least = interval if isinstance(interval, int) else 1 / interval
         if least > batches:

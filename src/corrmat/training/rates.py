@@ -58,7 +58,8 @@ def sweep(
         By arm, the results in the order of the rates.
 
     Raises:
-        CorrmatError: no arm has a rate to choose, or a budget in steps to take a twentieth of.
+        CorrmatError: no arm has a rate to choose, or a budget in steps to take a twentieth of; or,
+            when all is written, an arm diverged at every rate.
     """
     path = results / FOLDER / recipe.place.parent / f"{recipe.place.name}.json"
     ensure_writable(path.parent)
@@ -98,20 +99,18 @@ def sweep(
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     replace_text(path, json.dumps(content, indent=1) + "\n")
+    for name, rates in swept.items():
+        if chosen(rates) is None:
+            tried = ", ".join(f"{rate.lr:g}" for rate in rates)
+            raise CorrmatError(f"{name}: training diverged at every rate: {tried}")
     return swept
 
 
-def chosen(rates: list[RateResult]) -> float:
-    """Return the rate with the lowest rotation error on validation.
-
-    Raises:
-        CorrmatError: training diverged at every rate.
-    """
-    errors = {r.lr: r.rotation_error_deg_mean for r in rates}
+def chosen(rates: list[RateResult]) -> float | None:
+    """Return the rate with the lowest rotation error on validation; None if all diverged."""
+    errors = {rate.lr: rate.rotation_error_deg_mean for rate in rates}
     finite = {lr: error for lr, error in errors.items() if error is not None}
-    if not finite:
-        raise CorrmatError(f"training diverged at every rate: {', '.join(map(str, errors))}")
-    return min(finite, key=finite.__getitem__)
+    return min(finite, key=finite.__getitem__, default=None)
 
 
 def _short(settings: ArmSettings, factor: float) -> ArmSettings:

@@ -130,9 +130,13 @@ def load(
         if arm not in all_arms:
             raise CorrmatError(f"{path}: unknown arm {arm!r}; arms: {', '.join(all_arms)}")
     common = {key: merged[key] for key in ("seed", "start", *GROUPS) if key in merged}
+    layers = {arm: dict(all_arms[arm] or {}) for arm in arms or all_arms}
+    methods = [str(layer.get("method", arm)) for arm, layer in layers.items()]
     settings = {
-        arm: _arm_settings(arm, common, dict(all_arms[arm] or {}), overrides or {}, path)
-        for arm in arms or all_arms
+        arm: _arm_settings(
+            arm, common, layer, _overrides_of(method, methods, overrides or {}), path
+        )
+        for (arm, layer), method in zip(layers.items(), methods, strict=True)
     }
     return Recipe(
         id=str(merged["id"]),
@@ -283,6 +287,28 @@ def _roles(
         "treatment": treatment if treatment in chosen else next(iter(chosen)),
         "controls": tuple(arm for arm in controls if arm in chosen),
     }
+
+
+def _overrides_of(
+    method: str, methods: Sequence[str], overrides: Mapping[str, object]
+) -> Mapping[str, object]:
+    """Leave out the options of networks and losses that only other arms' methods have."""
+
+    def has(name: str, group: str, option: str) -> bool:
+        classes = METHODS.get(name)
+        kind = classes and {"network": classes.network_type, "loss": classes.LossSettings}[group]
+        return kind is not None and option in _parameters(kind)
+
+    kept = dict(overrides)
+    for group in ("network", "loss"):
+        options = overrides.get(group)
+        if isinstance(options, Mapping):
+            kept[group] = {
+                option: value
+                for option, value in options.items()
+                if has(method, group, option) or not any(has(m, group, option) for m in methods)
+            }
+    return kept
 
 
 def _arm_settings(
