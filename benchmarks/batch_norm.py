@@ -1,19 +1,17 @@
-"""What DCP's batch norms cost: the same networks with running statistics and with a batch's own.
+"""What DCP's batch norms cost: a network with running statistics and with each batch's own.
 
-    python benchmarks/batch_norm.py 1.2 laptop shapes
-    python benchmarks/batch_norm.py outliers laptop modelnet40 ROOT
+    python benchmarks/batch_norm.py 1.2 "DCP_corr, never frozen" never_frozen.safetensors
+    python benchmarks/batch_norm.py 1.2 "DCP_corr, frozen after 70 %" 1.2/DCP_corr
 
 In training a batch norm normalises the sources of a batch by their statistics, and the targets by
 theirs. In a test both are normalised by one set of running statistics. Where the two clouds differ,
-that is another network than was trained. This trains DCP and DCP_corr with statistics that are
-never frozen, and with the recipe's. It tests each network both ways, on the same pairs in the same
-batches, and adds the medians to results/batch_norm.json.
+that is another network than was trained. This tests one both ways, on the test pairs of scale
+overnight in batches as in training, and adds the medians to results/batch_norm.json.
 """
 
 import json
-import logging
 import sys
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 from torch import nn
@@ -22,15 +20,14 @@ from corrmat.files import replace_text
 from corrmat.methods import Method
 from corrmat.reporting.intervals import match_accuracy, median_rotation, pair_errors
 from corrmat.reporting.writer import pair_rows
-from corrmat.training.console import Board
-from corrmat.training.experiment import train_or_reuse
-from corrmat.training.fit import load_trained, score
-from corrmat.training.preflight import Arm, prepare
+from corrmat.revision import commit
+from corrmat.training.fit import score
+from corrmat.training.preflight import Arm, build_method, prepare
 from corrmat.training.recipe import load
+from corrmat.weights import load_model, load_state
 
 ROOT = Path(__file__).resolve().parents[1]
 PATH = ROOT / "results" / "batch_norm.json"
-ARMS = "DCP", "DCP_corr"
 
 
 def use_statistics_of_batches(method: Method) -> None:
@@ -49,44 +46,27 @@ def medians(method: Method, arm: Arm) -> dict[str, object]:
     }
 
 
-def main(identity: str, scale: str, data: str, root: str | None = None) -> None:
-    """Train and test both arms of an experiment, with and without frozen statistics.
+def main(identity: str, name: str, model: str) -> None:
+    """Test a network with both statistics, and write the medians.
 
     Args:
-        identity: of the experiment, 1.1 to 1.3 or outliers.
-        scale: of the recipe.
-        data: to train and test on.
-        root: folder of the data set.
+        identity: of the experiment on whose pairs to test.
+        name: of the network in the table, beginning with its arm's.
+        model: shipped network or checkpoint of DCP.
     """
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    today = commit()
     path = ROOT / "configs" / "exp" / f"{identity}.yaml"
-    recipe = load(path, scale, {"data": {"data": data, "root": root}})
-    never = replace(recipe, id=f"{identity}-norms-never-frozen")
-    rows = []
-    with Board() as board:
-        for name in ARMS:
-            own = recipe.arms[name]
-            unfrozen = replace(own, optimizer=replace(own.optimizer, freeze_norms=1.0))
-            for place, settings in ((never, unfrozen), (recipe, own)):
-                arm = prepare(settings)
-                trained = train_or_reuse(place, arm, ROOT / "runs", "csv", board)
-                method = load_trained(arm, trained.checkpoint)
-                running = medians(method, arm)
-                use_statistics_of_batches(method)
-                rows.append(
-                    {
-                        "arm": name,
-                        "freeze_norms": settings.optimizer.freeze_norms,
-                        "pairs_seen": trained.pairs_seen,
-                        "commit": trained.commit,
-                        "running": running,
-                        "batch": medians(method, arm),
-                    }
-                )
-                print(json.dumps(rows[-1], indent=1), flush=True)
+    arm_name = name.split(",")[0]
+    arm = prepare(load(path, "overnight", {}, [arm_name]).arms[arm_name])
+    method = build_method(arm.settings)
+    load_state(method.network, load_model(model).state_dict())
+    running = medians(method, arm)
+    use_statistics_of_batches(method)
+    result = {"commit": today, "running": running, "batch": medians(method, arm)}
     content = json.loads(PATH.read_text()) if PATH.is_file() else {}
-    content[f"{identity}, {scale}, {data}"] = rows
+    content[f"{identity} {name}"] = result
     replace_text(PATH, json.dumps(content, indent=1) + "\n")
+    print(json.dumps(result, indent=1))
 
 
 if __name__ == "__main__":

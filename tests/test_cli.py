@@ -134,6 +134,11 @@ def test_bad_commands_exit_with_2(words, capsys):
         (["register", "a.ply", "b.ply", "--jsn", "x"], "see corrmat register --help"),
         (["nonsense"], "see corrmat --help"),
         (["register", "a.ply", "b.ply", "--gif", "a.png"], "the animation is a GIF, a.png has"),
+        (["register", "a.ply", "b.ply", "--html", "a.txt"], "the page is HTML, a.txt has"),
+        (
+            ["register", "a/c.stl", "b/c.obj", "d.ply", "-o", "m"],
+            "a/c.stl and b/c.obj would both become m/c.ply: rename one",
+        ),
         (["report", "-o", "."], ". is a folder, not a file to write"),
         (["compare", "icp", "--data", "modelnet40"], "or --root ..."),
     ],

@@ -44,7 +44,7 @@ from corrmat.registration.scoring import COARSE_POINTS, AlignmentScorer
 from corrmat.registration.verification import verify
 from corrmat.registration.view import registration_page
 from corrmat.types import Prediction
-from corrmat.weights import load_model
+from corrmat.weights import export_model, load_model
 
 BROWSER = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
@@ -283,6 +283,30 @@ def test_many_points_are_subsampled_evenly():
     assert len(set(actual.rows.tolist())) == preparation.FULL_POINTS
     assert np.abs(actual.centre).max() < 0.03
     assert abs(np.median(actual.rows) - 50_000) < 1500  # from everywhere in the file
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_json_alone_goes_to_standard_output(pair, several, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    scans = [str(pair[0] / f"{name}.ply") for name in ("source", "target")]
+    if several:
+        scans.insert(0, scans[0])
+    assert main(["register", *scans, "--model", "icp", "--json", "-"]) == 0
+    printed = capsys.readouterr()
+    content = json.loads(printed.out)
+    assert (content["model"], content["seed"]) == ("icp", 0)
+    assert "confidence" in printed.err
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_copy_of_the_shipped_weights_is_calibrated_as_they_are(pair, tmp_path):
+    _, source, target, _ = pair
+    export_model("corrmat", tmp_path / "copy")
+    registrations = [
+        corrmat.register(source, target, model=model) for model in (tmp_path / "copy", "icp")
+    ]
+    assert [registration.calibrated for registration in registrations] == [True, False]
+    assert "not to this model" not in result.to_text(registrations[0])
 
 
 @pytest.mark.parametrize(("model", "said"), [("icp", 0), ("corrmat", 13)])

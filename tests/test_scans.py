@@ -10,6 +10,7 @@ import trimesh
 from PIL import Image
 from plyfile import PlyData, PlyElement, PlyHeaderParseError
 
+from corrmat.data import scans
 from corrmat.data.scans import CLOUDS, MESHES, read_scan, write_moved, write_ply
 from corrmat.errors import CorrmatError
 
@@ -144,6 +145,13 @@ def test_a_comment_may_be_in_any_encoding(tmp_path):
         comment = "ply\ncomment Körper".encode(encoding)
         (tmp_path / "latin.ply").write_bytes(content.replace(b"ply", comment, 1))
         assert (read_scan(tmp_path / "latin.ply") == POINTS).all()
+
+
+def test_a_binary_ply_is_mapped_into_memory(tmp_path):
+    """Row by row plyfile takes ten seconds for a million points."""
+    write_ply(tmp_path / "large.ply", POINTS)
+    vertices = scans._ply_content(tmp_path / "large.ply")["vertex"]
+    assert isinstance(vertices.data, np.memmap)
 
 
 def test_points_of_a_ply_with_edges_are_points(tmp_path):

@@ -1,5 +1,6 @@
 """The command line and the scripts of reproduce/; options.py parses."""
 
+import contextlib
 import os
 import shlex
 import sys
@@ -14,6 +15,8 @@ from corrmat.options import EXPERIMENT_COMMANDS, SHORT_HELP, build_parser, parse
 
 if TYPE_CHECKING:
     from corrmat.training.recipe import Recipe
+
+_STDOUT = Path("-")  # as a file to write
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -109,13 +112,14 @@ def _exit_code(run: Callable[[], int]) -> int:
     """Call a function; turn what went wrong into a line and an exit code."""
     try:
         code = run()
-        sys.stdout.flush()  # here a closed pipe can be dealt with
+        if sys.stdout:  # None if it is closed
+            sys.stdout.flush()  # here a closed pipe can be dealt with
         return code
     except CorrmatError as error:
         print(f"corrmat: error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("corrmat: interrupted; nothing was recorded", file=sys.stderr)
+        print("corrmat: interrupted", file=sys.stderr)
         return 1
     except BrokenPipeError:  # the reader of our output has closed it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -262,10 +266,15 @@ def _register(options: Namespace) -> int:
     """Register one file, or several, onto another."""
     from corrmat.files import ensure_writable
 
-    files = [*filter(None, (options.json, options.html, options.gif)), *_moved_files(options)]
+    json_file = None if options.json == _STDOUT else options.json
+    files = [*filter(None, (json_file, options.html, options.gif)), *_moved_files(options)]
     written = [path.resolve() for path in files]
-    if options.gif is not None and options.gif.suffix.lower() not in (".gif", ""):
-        raise CorrmatError(f"the animation is a GIF, {options.gif} has another suffix")
+    for path, what, suffixes in (
+        (options.gif, "the animation is a GIF", (".gif", "")),
+        (options.html, "the page is HTML", (".html", ".htm", "")),
+    ):
+        if path is not None and path.suffix.lower() not in suffixes:
+            raise CorrmatError(f"{what}, {path} has another suffix")
     for path in files:
         if written.count(path.resolve()) > 1:
             raise CorrmatError(f"{path} is named for two results, and one would be lost")
@@ -277,7 +286,11 @@ def _register(options: Namespace) -> int:
                 raise CorrmatError(f"{path} is one of the scans, and would be overwritten")
         if path.is_file() or not path.exists():  # not a pipe
             ensure_writable(path.parent)
-    return (_register_several if len(options.source) > 1 else _register_pair)(options)
+    with contextlib.redirect_stdout(sys.stderr if options.json == _STDOUT else sys.stdout):
+        content = (_register_several if len(options.source) > 1 else _register_pair)(options)
+    if options.json == _STDOUT:
+        print(content, end="")
+    return 0
 
 
 def _moved_files(options: Namespace) -> list[Path]:
@@ -298,7 +311,9 @@ def _moved_files(options: Namespace) -> list[Path]:
         raise CorrmatError(f"{output}: with several scans, --output is a folder")
     names = [path.with_suffix(".ply").name for path in scans]
     if len(set(names)) < len(names):
-        raise CorrmatError(f"two scans would both be written to {output}: rename one")
+        twice = next(name for name in names if names.count(name) > 1)
+        both = [str(scan) for scan, name in zip(scans, names, strict=True) if name == twice]
+        raise CorrmatError(f"{' and '.join(both)} would both become {output / twice}: rename one")
     return [output / name for name in names]
 
 
@@ -308,8 +323,8 @@ def _refuse_folder(path: Path) -> None:
         raise CorrmatError(f"{path} is a folder, not a file to write")
 
 
-def _register_pair(options: Namespace) -> int:
-    """Register one file onto another."""
+def _register_pair(options: Namespace) -> str:
+    """Register one file onto another; return the result as JSON."""
     from corrmat.data.scans import read_scan, write_moved
     from corrmat.files import replace_bytes, replace_text
 
@@ -325,9 +340,8 @@ def _register_pair(options: Namespace) -> int:
     if options.output is not None:
         write_moved(options.output, options.source[0], registration.transform)
         print(f"moved source: {options.output}")
-    if options.json is not None:
-        replace_text(options.json, to_json(registration, *names))
-        print(f"result: {options.json}")
+    content = to_json(registration, *names)
+    _write_json(options.json, content)
     if options.html is not None:
         from corrmat.registration.view import registration_page  # plotly takes a second to import
 
@@ -338,15 +352,23 @@ def _register_pair(options: Namespace) -> int:
 
         replace_bytes(options.gif, registration_gif(registration, source, target))
         print(f"animation: {options.gif}")
-    return 0
+    return content
 
 
-def _register_several(options: Namespace) -> int:
-    """Register several files onto one."""
+def _write_json(path: Path | None, content: str) -> None:
+    """Write a result to the file that --json names; standard output comes last."""
+    from corrmat.files import replace_text
+
+    if path is not None and path != _STDOUT:
+        replace_text(path, content)
+        print(f"result: {path}")
+
+
+def _register_several(options: Namespace) -> str:
+    """Register several files onto one; return the result as JSON."""
     if options.html or options.gif:
         raise CorrmatError("--html and --gif show two scans; --output moves several, to look at")
     from corrmat.data.scans import read_scan, write_moved
-    from corrmat.files import replace_text
 
     scans = [read_scan(path, options.seed) for path in (*options.source, options.target)]
     from corrmat.registration import pose_graph
@@ -354,16 +376,17 @@ def _register_several(options: Namespace) -> int:
     poses = pose_graph.register_scans(
         scans, model=options.model, refine=options.refine, seed=options.seed
     )
-    print(pose_graph.to_text(options.source, options.target, poses, options.model))
+    print(pose_graph.to_text(options.source, options.target, poses))
     if options.output is not None:
         options.output.mkdir(parents=True, exist_ok=True)
         for path, scan, pose in zip(_moved_files(options), options.source, poses, strict=True):
             write_moved(path, scan, pose.transform)
         print(f"moved scans: {options.output}")
-    if options.json is not None:
-        replace_text(options.json, pose_graph.to_json(options.source, options.target, poses))
-        print(f"result: {options.json}")
-    return 0
+    content = pose_graph.to_json(
+        options.source, options.target, poses, model=options.model, seed=options.seed
+    )
+    _write_json(options.json, content)
+    return content
 
 
 def _export(options: Namespace) -> int:

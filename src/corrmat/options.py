@@ -314,7 +314,9 @@ def _add_register_options(parser: ArgumentParser) -> None:
         help="write the moved source, with the faces and colours that a PLY has; the folder to "
         "write them into, if there are several",
     )  # fmt: skip
-    parser.add_argument("--json", type=Path, help="write matrix, confidence and verdict")
+    parser.add_argument(
+        "--json", type=Path, help="write matrix, confidence and verdict; - is standard output"
+    )
     parser.add_argument("--html", type=Path, help="write a page: before, matches, after")
     parser.add_argument("--gif", type=Path, help="write an animation of the same")
     parser.add_argument(

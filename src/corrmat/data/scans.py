@@ -220,13 +220,19 @@ def _ply(path: Path) -> "np.ndarray | trimesh.Trimesh":
 
 
 def _ply_content(path: Path) -> "plyfile.PlyData":
-    """Read a PLY file; its header may have comments in any encoding, and blanks at line ends."""
+    """Read a PLY file; its header may have comments in any encoding, and blanks at line ends.
+
+    plyfile maps a binary file into memory, but goes through anything else row by row.
+    """
     import plyfile
 
     with path.open("rb") as file:
-        header = re.sub(rb"[ \t]+\n", b"\n", _ply_header(file)).decode("ascii", "replace")
-        content = header.encode("ascii", "replace") + file.read()
-    return plyfile.PlyData.read(io.BytesIO(content))
+        header = _ply_header(file)
+        clean = re.sub(rb"[ \t]+\n", b"\n", header).decode("ascii", "replace")
+        clean = clean.encode("ascii", "replace")
+        if clean == header:
+            return plyfile.PlyData.read(str(path))
+        return plyfile.PlyData.read(io.BytesIO(clean + file.read()))
 
 
 def _ply_header(file: BinaryIO) -> bytes:

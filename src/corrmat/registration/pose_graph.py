@@ -30,6 +30,7 @@ class ScanPose:
 
     transform: np.ndarray  # (4, 4) float64, T_target_scan, in the scans' own units
     confidence: float  # of the weakest registration on the surest way; low if most disagree
+    calibrated: bool  # whether it was fitted to the model
     agree: int  # registrations of this scan that agree with the poses
     verdict: str  # as of a `Registration`
 
@@ -65,32 +66,38 @@ def register_scans(
         Cloud.of(scan, f"scan {number} of {len(scans)}", seed)  # so that errors name the right one
         for number, scan in enumerate(scans, 1)
     ]
-    edges = []
+    edges, calibrated = [], True
     pairs = list(itertools.combinations(range(len(scans)), 2))
     for i, j in track(pairs, "registering pairs", transient=True, disable=len(pairs) == 1):
         registration = register(scans[i], scans[j], model=model, refine=refine, seed=seed)
         edges.append(_Edge(i, j, registration.transform, registration.confidence))
+        calibrated = registration.calibrated
     graph = _PoseGraph(clouds, edges)
-    return [graph.pose(index) for index in range(len(scans) - 1)]
+    return [graph.pose(index, calibrated) for index in range(len(scans) - 1)]
 
 
-def to_text(paths: Sequence[Path], target: Path, poses: Sequence[ScanPose], model: str) -> str:
+def to_text(paths: Sequence[Path], target: Path, poses: Sequence[ScanPose]) -> str:
     """Format poses for people."""
-    note = note_on_confidence(model)
     lines = [f"every scan onto {target} (target = matrix @ scan):"]
     for path, pose in zip(paths, poses, strict=True):
-        lines.append(f"{path}: {pose.verdict}, confidence {pose.confidence:.0%}{note}")
+        lines.append(
+            f"{path}: {pose.verdict}, confidence {pose.confidence:.0%}"
+            f"{note_on_confidence(pose.calibrated)}"
+        )
         lines += matrix_lines(pose.transform)
     return "\n".join(lines)
 
 
-def to_json(paths: Sequence[Path], target: Path, poses: Sequence[ScanPose]) -> str:
-    """Format poses for programs."""
+def to_json(
+    paths: Sequence[Path], target: Path, poses: Sequence[ScanPose], *, model: str, seed: int
+) -> str:
+    """Format poses, by this model and seed, for programs."""
     scans = [
         {"scan": str(path), **asdict(pose), "transform": pose.transform.tolist()}
         for path, pose in zip(paths, poses, strict=True)
     ]
-    return json.dumps({"target": str(target), "scans": scans}, indent=1) + "\n"
+    content = {"target": str(target), "model": model, "seed": seed, "scans": scans}
+    return json.dumps(content, indent=1) + "\n"
 
 
 @dataclass(frozen=True)
@@ -129,7 +136,7 @@ class _PoseGraph:
             for index in range(self.last):
                 self._average(index)
 
-    def pose(self, index: int) -> ScanPose:
+    def pose(self, index: int, calibrated: bool) -> ScanPose:
         """Return the pose of a scan."""
         rotation = self.rotations[index]
         translation = self.images[index] - rotation @ self.centres[index]
@@ -139,7 +146,7 @@ class _PoseGraph:
         if 2 * agree < len(mine):
             confidence = min(confidence, DOUBTFUL)
         reason = f"{agree} of {len(mine)} registrations agree"
-        return ScanPose(transform, confidence, agree, verdict(confidence, reason))
+        return ScanPose(transform, confidence, calibrated, agree, verdict(confidence, reason))
 
     def _edges_of(self, index: int) -> list[_Edge]:
         return [edge for edge in self.edges if index in (edge.source, edge.target)]

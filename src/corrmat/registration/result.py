@@ -18,7 +18,8 @@ class Registration:
     support: float  # in [0, 1]: share of the matches that the transform explains; 1 without any
     coherence: float | None  # of two clouds of more than 2,048 points; None for others
     correlation: float | None  # their phase correlation; None for others
-    confidence: float  # in [0, 1]: chance that the clouds are aligned, calibrated for "corrmat"
+    confidence: float  # in [0, 1]: chance that the clouds are aligned
+    calibrated: bool  # whether it was fitted to this model, i.e. to the shipped weights
     rmse: float  # of aligned source points near a target point, in the clouds' units
     overlap: float  # share of source points near a target point: twice the spacing of points
     verdict: str  # "aligned", or "probably aligned: " or "doubtful: " and why
@@ -48,16 +49,16 @@ def to_text(registration: Registration) -> str:
         agree, matches = registration.match_agrees.sum(), len(registration.matches)
         lines.append(f"matches      {agree} of {matches} agree with the transform")
     lines += [
-        f"confidence   {registration.confidence:.0%}{note_on_confidence(registration.model)}",
+        f"confidence   {registration.confidence:.0%}{note_on_confidence(registration.calibrated)}",
         f"verdict      {registration.verdict}",
     ]
     lines.append(f"({registration.model}, seed {registration.seed}, {registration.seconds:.2f} s)")
     return "\n".join(filter(None, lines))
 
 
-def note_on_confidence(model: str) -> str:
-    """Say what a model's confidence was not fitted to; nothing of the shipped weights."""
-    return "" if model == "corrmat" else "  (fitted to the shipped weights, not to this model)"
+def note_on_confidence(calibrated: bool) -> str:
+    """Say which confidence was not fitted to its model."""
+    return "" if calibrated else "  (fitted to the shipped weights, not to this model)"
 
 
 def matrix_lines(transform: np.ndarray) -> list[str]:
@@ -67,7 +68,7 @@ def matrix_lines(transform: np.ndarray) -> list[str]:
 
 def to_json(registration: Registration, source: str, target: str) -> str:
     """Format a registration, of these files, for programs."""
-    names = ("confidence", "rmse", "overlap", "verdict", "model", "seed", "seconds")
+    names = ("confidence", "calibrated", "rmse", "overlap", "verdict", "model", "seed", "seconds")
     values = {name: getattr(registration, name) for name in names}
     if not np.isfinite(registration.rmse):
         values["rmse"] = None

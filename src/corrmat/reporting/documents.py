@@ -159,19 +159,14 @@ def low_rate_table(results: Path) -> str:
 
 def batch_norm_table(results: Path) -> str:
     """Build the table of DCP's arms under running statistics and under those of each batch."""
-    heads = ["record", "pairs", "arm", "statistics frozen", "tested with", "median, deg", "matches"]
-    lines = markdown_head(heads)
+    lines = markdown_head(["network", "tested with", "median, deg", "correct matches"])
     path = results / "batch_norm.json"
     tests = json.loads(path.read_text()) if path.is_file() else {}
-    for name, rows in sorted(tests.items()):
-        for row in rows:
-            share = row["freeze_norms"]
-            frozen = "never" if share == 1 else f"after {share:.0%}"
-            for statistics, said in (("running", "running statistics"), ("batch", "each batch's")):
-                degrees = as_text(Estimate(**row[statistics]["median_deg"]))
-                matches = as_text(Estimate(**row[statistics]["match_accuracy"]), "%")
-                cells = [name, f"{row['pairs_seen']:,}", row["arm"], frozen, said, degrees, matches]
-                lines.append(markdown_row(cells))
+    for name, test in sorted(tests.items()):
+        for statistics, said in (("running", "running statistics"), ("batch", "each batch's")):
+            degrees = as_text(Estimate(**test[statistics]["median_deg"]))
+            matches = as_text(Estimate(**test[statistics]["match_accuracy"]), "%")
+            lines.append(markdown_row([name, said, degrees, matches]))
     return "\n".join(lines)
 
 
