@@ -306,6 +306,7 @@ def test_a_copy_of_the_shipped_weights_is_calibrated_as_they_are(pair, tmp_path)
         corrmat.register(source, target, model=model) for model in (tmp_path / "copy", "icp")
     ]
     assert [registration.calibrated for registration in registrations] == [True, False]
+    assert len(repr(registrations[0])) < 200
     assert "not to this model" not in result.to_text(registrations[0])
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Registration:
     """The rigid transform that takes a source onto a target, and how far to trust it."""
 
@@ -26,6 +26,14 @@ class Registration:
     model: str
     seed: int
     seconds: float
+
+    def __repr__(self) -> str:
+        """Say the most important, without arrays."""
+        confidence, angle = (
+            f"confidence={self.confidence:.2f}",
+            f"rotation_deg={self.rotation_deg:.2f}",
+        )
+        return f"Registration({self.verdict!r}, {confidence}, {angle}, model={self.model!r})"
 
     @property
     def rotation_deg(self) -> float:
