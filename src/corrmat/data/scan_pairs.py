@@ -99,9 +99,9 @@ def _seen(halves: tuple[np.ndarray, ...], rng: np.random.Generator) -> list[np.n
     camera = Rotation.random(rng=rng).apply([0.0, 0.0, _CAMERA])
     axis = np.cross(camera, rng.standard_normal(3))
     angle = np.radians(rng.uniform(0, _MAX_ANGLE_DEG))
-    turn = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis))
+    between = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis))
     seen = []
-    for half, place in zip(halves, (camera, turn.apply(camera)), strict=True):
+    for half, place in zip(halves, (camera, between.apply(camera)), strict=True):
         scan = half[visible_points(half, place)]
         seen.append(scan + depth_noise(scan, place, NOISE_M * rng.standard_normal(scan.shape)))
     return seen

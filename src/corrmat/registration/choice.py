@@ -114,9 +114,9 @@ def find_candidates(
     weights = weights_for(hypotheses, scorers)
     best = refined[best_by_measures(measures, weights, HALF_TURNED)]
     turned = np.concatenate([half_turned(each, subsamples) for each in best])
-    every = distinct(np.concatenate([refined, refine_some(turned, hypotheses, scorer)]))
-    added = measure(every[len(refined) :], hypotheses, subsamples, scorers)
-    return every, np.concatenate([measures, added])
+    candidates = distinct(np.concatenate([refined, refine_some(turned, hypotheses, scorer)]))
+    added = measure(candidates[len(refined) :], hypotheses, subsamples, scorers)
+    return candidates, np.concatenate([measures, added])
 
 
 def refine_some(

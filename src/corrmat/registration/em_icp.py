@@ -96,23 +96,23 @@ def _sums_over_matches(match: Tensor, terms: Tensor) -> Tensor:
     return rows * (match @ (columns * terms))
 
 
-def _gauss_newton(points: Tensor, force: Tensor, stiffness: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute the rigid motion that balances the forces of springs.
+def _gauss_newton(points: Tensor, gradient: Tensor, hessian: Tensor) -> tuple[Tensor, Tensor]:
+    """Compute the Gauss-Newton step of a rigid motion of points, each with a quadratic cost.
 
     Args:
-        points: (N, 3), where the springs are attached.
-        force: (N, 3), with which they push.
-        stiffness: (N, 3, 3), symmetric.
+        points: (N, 3).
+        gradient: (N, 3) of each point's cost by its position.
+        hessian: (N, 3, 3) of the same, symmetric.
 
     Returns:
         Rotation (3, 3) and translation (3,).
     """
-    turned = torch.linalg.cross(points.unsqueeze(2), stiffness, dim=1)  # [p]x K
-    both = torch.linalg.cross(points.unsqueeze(2), turned.mT, dim=1).sum(0)  # [p]x K [p]x^T
+    turned = torch.linalg.cross(points.unsqueeze(2), hessian, dim=1)  # [p]x H
+    both = torch.linalg.cross(points.unsqueeze(2), turned.mT, dim=1).sum(0)  # [p]x H [p]x^T
     turned = turned.sum(0)
-    matrix = torch.cat([torch.cat([both, turned], 1), torch.cat([turned.T, stiffness.sum(0)], 1)])
-    vector = torch.cat([torch.linalg.cross(points, force).sum(0), force.sum(0)])
-    # Without any match there is nothing to balance, and no step.
+    matrix = torch.cat([torch.cat([both, turned], 1), torch.cat([turned.T, hessian.sum(0)], 1)])
+    vector = torch.cat([torch.linalg.cross(points, gradient).sum(0), gradient.sum(0)])
+    # Without any match the cost is flat, and there is no step.
     matrix = matrix.double() + 1e-6 * torch.eye(6, dtype=torch.float64)
     rotvec, shift = -torch.linalg.solve(matrix, vector.double()).float().view(2, 3)
     return rigid.axis_angle_to_matrix(F.normalize(rotvec, dim=0), rotvec.norm()), shift

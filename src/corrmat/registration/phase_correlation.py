@@ -54,14 +54,14 @@ class PhaseCorrelation:
             (count, 4, 4) transforms of source onto target, the highest correlation first; exact
             to half a voxel.
         """
-        turns = Rotation.create_group("O").as_matrix()
-        between_frames = self._target_frame.T @ turns @ self._source_frame
+        of_axes = Rotation.create_group("O").as_matrix()
+        between_frames = self._target_frame.T @ of_axes @ self._source_frame
         rotations = np.concatenate([between_frames, rotations])
         heights = np.stack([self._correlate(rotation, np.zeros(3)) for rotation in rotations])
-        turn, cells = highest_peaks(heights, count)
+        rows, cells = highest_peaks(heights, count)
         half = self._size // 2
         shifts = _VOXEL * ((cells + half) % self._size - half)
-        return rigid.to_homogeneous(rotations[turn], shifts @ self._target_frame)
+        return rigid.to_homogeneous(rotations[rows], shifts @ self._target_frame)
 
     def at(self, transform: np.ndarray) -> float:
         """Compute the highest correlation within a voxel of a transform (4, 4); at most 4."""

@@ -86,8 +86,8 @@ def register(
         candidates = hypotheses.transforms
         measures = measure(candidates, hypotheses, subsamples, scorers)
 
-    def verified(some: np.ndarray) -> np.ndarray:
-        return verify(candidates[some], hypotheses, subsamples)
+    def verified(rows: np.ndarray) -> np.ndarray:
+        return verify(candidates[rows], hypotheses, subsamples)
 
     transform = candidates[choose(measures, weights_for(hypotheses, scorers), verified)]
     if refine == "icp":

@@ -123,11 +123,11 @@ def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:
         pairs = benchmark.frozen_pairs(
             protocol, points=SCAN_POINTS, count=CALIBRATION_SCANS, split="val"
         )
-        strangers = benchmark.unrelated(pairs, CALIBRATION_UNRELATED)
-        result, wrong = (benchmark.compare(each, [model])[model] for each in (pairs, strangers))
+        unrelated = benchmark.unrelated(pairs, CALIBRATION_UNRELATED)
+        result, wrong = (benchmark.compare(each, [model])[model] for each in (pairs, unrelated))
         recalls[protocol] = result.recall_5deg
         large_scores += result.scores + wrong.scores
-        large_aligned += [*result.aligned.tolist(), *[False] * len(strangers)]
+        large_aligned += [*result.aligned.tolist(), *[False] * len(unrelated)]
     curve = Calibration(
         both=_fit_logistic(np.array(scores)[:, :2].astype(float), np.array(aligned, float)),
         large=_fit_logistic(
@@ -136,10 +136,10 @@ def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:
         ),
         agreement=_fit_logistic(np.array(agreements)[:, None], np.array(aligned_alone, float)),
     )
-    for of, right in ((scores, aligned), (large_scores, large_aligned)):
-        sure = np.array([curve.confidence(*each) >= SURE for each in of])
+    for values, right in ((scores, aligned), (large_scores, large_aligned)):
+        sure = np.array([curve.confidence(*each) >= SURE for each in values])
         wrongly = np.mean(sure & ~np.array(right))
-        called = f"{sure.mean():.1%} of {len(of)} held-out pairs, {wrongly:.1%} wrongly"
+        called = f"{sure.mean():.1%} of {len(values)} held-out pairs, {wrongly:.1%} wrongly"
         print(f'called "aligned": {called}')
     return asdict(curve), recalls
 

@@ -86,8 +86,8 @@ def _plate(rng: Rng) -> Trimesh:
     """A plate whose outline is a star-shaped polygon, convex or not."""
     corners = int(rng.integers(3, 9))
     angle = 2 * np.pi * (np.arange(corners) + rng.uniform(-0.3, 0.3, corners)) / corners
-    reach = rng.uniform(0.4, 1, (corners, 1))
-    outline = reach * np.column_stack([np.cos(angle), np.sin(angle)]) * (1, rng.uniform(0.3, 1))
+    radius = rng.uniform(0.4, 1, (corners, 1))
+    outline = radius * np.column_stack([np.cos(angle), np.sin(angle)]) * (1, rng.uniform(0.3, 1))
     return plate(list(outline), rng.uniform(0.03, 0.4))
 
 
