@@ -112,9 +112,9 @@ def keep_freed_memory() -> None:
 
 @contextlib.contextmanager
 def flush_denormals() -> Iterator[None]:
-    """Let numbers below 1e-38 be zero: many CPUs compute with them a hundred times slower.
+    """Let numbers below 1e-38 be zero: many CPUs compute far slower with them.
 
-    DCP's attention makes them where it is sharp, and a step then takes twice the time.
+    DCP's attention makes them where it is sharp.
     """
     torch.set_flush_denormal(True)
     try:
