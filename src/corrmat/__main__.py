@@ -1,7 +1,16 @@
-"""`python -m corrmat` is the console script `corrmat`."""
+"""The console script `corrmat`, and `python -m corrmat`."""
 
 import sys
 
-from corrmat.cli import main
 
-sys.exit(main())
+def start() -> None:
+    """Run the command line; Ctrl-C while it is imported leaves no traceback either."""
+    try:
+        from corrmat.cli import main
+    except KeyboardInterrupt:
+        sys.exit("corrmat: interrupted")
+    sys.exit(main())
+
+
+if __name__ == "__main__":
+    start()

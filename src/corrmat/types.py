@@ -68,3 +68,8 @@ class RegistrationNetwork(Protocol):
     def __call__(self, source: Tensor, target: Tensor) -> Prediction:
         """Register source (B, N, C) to target (B, M, C); C = 3, or 6 with unit normals."""
         ...
+
+
+def fewest_points(network: object) -> int:
+    """Return a network's `min_points`; 3, which determine a rotation, if it does not say."""
+    return int(getattr(network, "min_points", 3))

@@ -28,7 +28,7 @@ from corrmat.networks.verification import VerificationNetwork
 from corrmat.ops import rigid
 from corrmat.ops.correspondence import MatchabilityCorrespondence, SoftCorrespondence
 from corrmat.ops.ransac import best_by_matches, best_distinct, fit_triples
-from corrmat.types import MATCH_DISTANCE
+from corrmat.types import MATCH_DISTANCE, fewest_points
 from corrmat.weights import load_verification
 
 _STRONGEST = 256  # matches that RANSAC draws from
@@ -160,7 +160,7 @@ class NetworkHypotheses:
             Its own transform (1, 4, 4), and the correspondence matrix; None without any.
         """
         of_method = getattr(self.network, "network", self.network)
-        least = int(getattr(of_method, "min_points", 3))
+        least = fewest_points(of_method)
         if min(x.shape[1], y.shape[1]) < least:
             raise CorrmatError(f"this network needs clouds of at least {least} points")
         parameter = next(self.network.parameters(), x)  # where and in which precision it computes

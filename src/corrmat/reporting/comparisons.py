@@ -122,7 +122,7 @@ def families_table(results: Path) -> str:
         other = hits("without first, modelnet40", "without second, modelnet40")
         rows["modelnet40, both small networks"] = other
         rows["modelnet40, shipped network"] = hits("shipped, modelnet40")
-    lines = [markdown_row(["pairs", "count", "within 5 deg"]), "|---|---|---|"]
+    lines = markdown_head(["pairs", "count", "within 5 deg"])
     for what, within in rows.items():
         recall = f"{within.mean():.1%} ({_wilson(within)})"
         lines.append(markdown_row([what, str(len(within)), recall]))

@@ -155,7 +155,7 @@ def markdown_tables(records: Sequence[Record]) -> str:
     for record in records:
         heads, rows = table(record)
         parts.append(f"### {record.id}, {record.title}: {record.scale}, {record.data}\n")
-        parts += [markdown_row(heads), "|" + "---|" * len(heads), *map(markdown_row, rows), ""]
+        parts += [*markdown_head(heads), *map(markdown_row, rows), ""]
     return "\n".join(parts).rstrip()
 
 

@@ -13,7 +13,7 @@ from corrmat.errors import CorrmatError
 from corrmat.methods import METHODS, Method
 from corrmat.training.hardware import count_devices, trainer_options
 from corrmat.training.recipe import ArmSettings
-from corrmat.types import Prediction
+from corrmat.types import Prediction, fewest_points
 
 # Options of the Trainer that cut the frozen test pairs, or that checkpoints cannot go on from.
 _UNSUPPORTED = (
@@ -43,7 +43,7 @@ def prepare(settings: ArmSettings) -> Arm:
     method = build_method(settings)
     datamodule = RegistrationDataModule(**settings.data.as_dict(), seed=settings.seed)
     arm = Arm(settings.name, settings, datamodule)
-    required, points = getattr(method.network, "min_points", 1), datamodule.pairs.num_source
+    required, points = fewest_points(method.network), datamodule.pairs.num_source
     if points < required:
         raise CorrmatError(
             f"a source of {points} points is too small for {settings.method}, which needs "
