@@ -157,7 +157,7 @@ def test_what_does_not_go_with_several_scans_is_said(words, message, tmp_path, m
 
 def test_a_stray_point_does_not_widen_what_agrees():
     cloud = np.random.default_rng(0).normal(size=(500, 3))
-    edges = [pose_graph._Edge(0, 1, np.eye(4), 0.9)]
+    edges = [pose_graph._Edge(0, 1, np.eye(4), 0.9, True)]
     plain, stray = (
         pose_graph._PoseGraph([Cloud.of(points, "scan", 0)] * 2, edges)
         for points in (cloud, np.vstack([cloud, [[1e5, 0, 0]]]))

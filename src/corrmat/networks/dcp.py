@@ -1,6 +1,6 @@
 """Deep Closest Point (Wang & Solomon, ICCV 2019), the network of experiments 1.1 to 1.4."""
 
-from typing import Literal
+from typing import Literal, get_args
 
 from torch import Tensor, nn
 
@@ -10,6 +10,8 @@ from corrmat.networks.dgcnn import DGCNN
 from corrmat.networks.matching import MATCHING_HEADS, Outlier
 from corrmat.ops.rigid import procrustes
 from corrmat.types import Prediction
+
+Pointer = Literal["transformer", "identity"]
 
 
 class DCPNetwork(nn.Module):
@@ -30,7 +32,7 @@ class DCPNetwork(nn.Module):
     def __init__(
         self,
         width: int = 512,
-        pointer: Literal["transformer", "identity"] = "transformer",
+        pointer: Pointer = "transformer",
         heads: int = 4,
         feedforward: int = 1024,
         edge_channels: tuple[int, ...] = (64, 64, 128, 256),
@@ -38,7 +40,7 @@ class DCPNetwork(nn.Module):
         outlier: Outlier = "none",
     ) -> None:
         super().__init__()
-        require_choice("pointer", pointer, ("transformer", "identity"))
+        require_choice("pointer", pointer, get_args(Pointer))
         require_choice("outlier", outlier, MATCHING_HEADS)
         self.min_points = k
         self.embed = DGCNN(width, edge_channels, k)

@@ -35,9 +35,8 @@ class DGCNN(nn.Module):
         edges = edge_features(points, knn(points, self.k)).flatten(0, 1)  # (B * N, k, 6)
         if edge_mlp.is_worthwhile(edges):
             linears, norms = zip(*((layer.linear, layer.norm) for layer in self.edge), strict=True)
-            pooled = edge_mlp.batch_norm_edge_mlp(
-                edges, linears, norms, training=self.norm.training
-            )
+            follow_batches = self.norm.training  # norms may be frozen in training
+            pooled = edge_mlp.batch_norm_edge_mlp(edges, linears, norms, training=follow_batches)
         else:
             pooled = []
             for layer in self.edge:

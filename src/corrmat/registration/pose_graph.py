@@ -66,14 +66,13 @@ def register_scans(
         Cloud.of(scan, f"scan {number} of {len(scans)}", seed)  # so that errors name the right one
         for number, scan in enumerate(scans, 1)
     ]
-    edges, calibrated = [], True
+    edges = []
     pairs = list(itertools.combinations(range(len(scans)), 2))
     for i, j in track(pairs, "registering pairs", transient=True, disable=len(pairs) == 1):
-        registration = register(scans[i], scans[j], model=model, refine=refine, seed=seed)
-        edges.append(_Edge(i, j, registration.transform, registration.confidence))
-        calibrated = registration.calibrated
+        result = register(scans[i], scans[j], model=model, refine=refine, seed=seed)
+        edges.append(_Edge(i, j, result.transform, result.confidence, result.calibrated))
     graph = _PoseGraph(clouds, edges)
-    return [graph.pose(index, calibrated) for index in range(len(scans) - 1)]
+    return [graph.pose(index) for index in range(len(scans) - 1)]
 
 
 def to_text(paths: Sequence[Path], target: Path, poses: Sequence[ScanPose]) -> str:
@@ -108,6 +107,7 @@ class _Edge:
     target: int
     transform: np.ndarray  # (4, 4)
     confidence: float
+    calibrated: bool
 
     def seen_from(self, index: int) -> tuple[int, np.ndarray]:
         """Return the other scan and the transform of scan `index` onto it."""
@@ -136,7 +136,7 @@ class _PoseGraph:
             for index in range(self.last):
                 self._average(index)
 
-    def pose(self, index: int, calibrated: bool) -> ScanPose:
+    def pose(self, index: int) -> ScanPose:
         """Return the pose of a scan."""
         rotation = self.rotations[index]
         translation = self.images[index] - rotation @ self.centres[index]
@@ -145,6 +145,7 @@ class _PoseGraph:
         agree = sum(self._agrees(index, *self._predict(index, edge)) for edge in mine)
         if 2 * agree < len(mine):
             confidence = min(confidence, DOUBTFUL)
+        calibrated = all(edge.calibrated for edge in mine)
         reason = f"{agree} of {len(mine)} registrations agree"
         return ScanPose(transform, confidence, calibrated, agree, verdict(confidence, reason))
 

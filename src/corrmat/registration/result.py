@@ -29,11 +29,10 @@ class Registration:
 
     def __repr__(self) -> str:
         """Say the most important, without arrays."""
-        confidence, angle = (
-            f"confidence={self.confidence:.2f}",
-            f"rotation_deg={self.rotation_deg:.2f}",
+        return (
+            f"Registration({self.verdict!r}, confidence={self.confidence:.2f}, "
+            f"rotation_deg={self.rotation_deg:.2f}, model={self.model!r})"
         )
-        return f"Registration({self.verdict!r}, {confidence}, {angle}, model={self.model!r})"
 
     @property
     def rotation_deg(self) -> float:
