@@ -140,6 +140,19 @@ def test_the_verdicts_are_counted():
     )
 
 
+def test_the_summary_has_a_row_a_claim_and_a_column_a_scale():
+    one = claims.Claim("b", "", "", "laptop, shapes", "confirmed")
+    same = [one, dataclasses.replace(one, where="laptop, shapes, seed 1")]
+    longer = dataclasses.replace(one, where="overnight, shapes", verdict="not shown")
+    other = claims.Claim("a", "", "", "overnight, shapes", "contradicted")
+    assert claims.summarise_claims([*same, longer, other]).splitlines() == [
+        "| claim | laptop | overnight |",
+        "|---|---|---|",
+        "| a |  | 1 contradicted |",
+        "| b | 2 confirmed | 1 not shown |",
+    ]
+
+
 def test_growth_over_bands():
     edges = (0, 30, 60)
     flat = errors(

@@ -58,6 +58,11 @@ class Claim:
     verdict: Verdict
     kind: Kind = "other claims"
 
+    @property
+    def scale(self) -> str:
+        """Scale of the record, the first word of where it was trained."""
+        return self.where.partition(",")[0]
+
 
 @dataclass(frozen=True)
 class Evidence:
@@ -396,6 +401,21 @@ def count_verdicts(claims: Sequence[Claim]) -> str:
             each = ", ".join(f"{counts[verdict]} {verdict}" for verdict in get_args(Verdict))
             parts.append(f"*{kind}* ({counts.total()} records): {each}")
     return "; ".join(parts)
+
+
+def summarise_claims(claims: Sequence[Claim]) -> str:
+    """Build the table of how many records of each scale say what of a claim."""
+    scales = list(dict.fromkeys(claim.scale for claim in claims))
+    lines = markdown_head(["claim", *scales])
+    for words in sorted({claim.words for claim in claims}):
+        same = [claim for claim in claims if claim.words == words]
+        counts = (Counter(c.verdict for c in same if c.scale == scale) for scale in scales)
+        cells = [
+            ", ".join(f"{count[each]} {each}" for each in get_args(Verdict) if count[each])
+            for count in counts
+        ]
+        lines.append(markdown_row([words, *cells]))
+    return "\n".join(lines)
 
 
 def verdicts(record: Record, results: Path) -> str:

@@ -18,6 +18,7 @@ from corrmat.reporting.claims import (
     headline,
     markdown_claims,
     read_evidence,
+    summarise_claims,
 )
 from corrmat.reporting.comparisons import (
     choice_table,
@@ -261,6 +262,7 @@ TABLES: tuple[tuple[str, str, Callable[[Results], str]], ...] = (
     ("docs/reproduction.md", "weights", lambda results: weights_table(results.records)),
     ("docs/reproduction.md", "seeds", lambda results: seeds_table(results.folder)),
     ("docs/metrics.md", "tables", lambda results: markdown_tables(results.records)),
+    ("docs/claims.md", "summary", lambda results: summarise_claims(results.claims)),
     ("docs/claims.md", "claims", lambda results: markdown_claims(results.claims)),
     ("docs/register.md", "comparison", lambda results: comparison_table(results.folder)),
     ("docs/register.md", "choice", lambda results: choice_table(results.folder)),
