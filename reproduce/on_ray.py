@@ -1,6 +1,6 @@
 """Train every arm of every experiment on a Ray cluster; `make all LAUNCHER=ray` then tests them."""
 
-from corrmat.cli import train_on_ray
+from corrmat.scripts import train_on_ray
 
 if __name__ == "__main__":
     train_on_ray()

@@ -1,6 +1,6 @@
 """Experiment B of the supplement; see configs/exp/outliers.yaml."""
 
-from corrmat.cli import reproduce
+from corrmat.scripts import reproduce
 
 if __name__ == "__main__":
     reproduce("outliers")

@@ -4,7 +4,7 @@ Only what was trained at laptop scale on the embedded shapes is shipped; `make w
 checks that everything runs.
 """
 
-from corrmat.cli import train_weights
+from corrmat.scripts import train_weights
 
 if __name__ == "__main__":
     train_weights()

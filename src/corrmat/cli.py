@@ -1,4 +1,4 @@
-"""The command line and the scripts of reproduce/; options.py parses."""
+"""The command line; options.py parses it."""
 
 import contextlib
 import os
@@ -22,93 +22,10 @@ _STDOUT = Path("-")  # as a file to write
 def main(words: Sequence[str] | None = None) -> int:
     """Run a command; errors in the input are one line, without a traceback."""
     words = sys.argv[1:] if words is None else list(words)
-    return _exit_code(lambda: _run_command(words))
+    return exit_code(lambda: _run_command(words))
 
 
-def reproduce(experiment: str) -> None:
-    """Run the experiment of this id with the caller's options: all that reproduce/exp*.py do."""
-    config = _config_folder() / "exp" / f"{experiment}.yaml"
-    sys.exit(main(["run", "--config", str(config), *sys.argv[1:]]))
-
-
-def train_on_ray() -> None:
-    """Train every arm of every experiment on a Ray cluster: reproduce/on_ray.py."""
-
-    def run() -> int:
-        options, configs = _script_options()
-        from corrmat.training import cluster
-
-        cluster.train_all(
-            configs, options.scale, options.overrides, options.runs, options.logger,
-            fresh=options.fresh,
-        )  # fmt: skip
-        return 0
-
-    sys.exit(_exit_code(run))
-
-
-def sweep_rates(experiments: Sequence[str]) -> None:
-    """Choose the rates of these experiments' arms, or of --config's: reproduce/rates.py."""
-
-    def run() -> int:
-        options, configs = _script_options(experiments)
-        from corrmat.training import rates, recipe
-
-        for path in configs:
-            loaded = recipe.load(path, options.scale, options.overrides)
-            rates.sweep(loaded, options.results, options.runs, options.logger, fresh=options.fresh)
-        return 0
-
-    sys.exit(_exit_code(run))
-
-
-def ship_arms() -> None:
-    """Put the trained arms of recorded experiments into the package: reproduce/checkpoints.py."""
-
-    def run() -> int:
-        options, configs = _script_options()
-        from corrmat.training import recipe, shipping
-
-        for path in configs:
-            loaded = recipe.load(path, options.scale, options.overrides)
-            for name in shipping.ship_arms(loaded, options.results, options.runs):
-                print(f"shipped: {name}")
-        return 0
-
-    sys.exit(_exit_code(run))
-
-
-def train_weights() -> None:
-    """Train the weights that `corrmat register` ships: reproduce/weights.py.
-
-    Only weights of the laptop scale, trained on the embedded shapes, are shipped.
-    """
-
-    def run() -> int:
-        words = ["fit", "--config", str(_config_folder() / "weights.yaml"), *sys.argv[1:]]
-        options = parse(words)
-        from corrmat.registration import shipping
-        from corrmat.training import hardware, recipe, runs
-
-        loaded = recipe.load(options.config, options.scale, options.overrides)
-        shipped = recipe.load(_config_folder() / "weights.yaml", "laptop")
-        ships = (loaded.id, loaded.scale, loaded.data) == (shipped.id, "laptop", shipped.data)
-        arm = loaded.arms[loaded.treatment]
-        results = _config_folder().parent / "results"
-        if ships and arm.start == "corrmat":
-            shipping.refuse_used_seed(results, arm.seed)
-        _fit(options)
-        if ships and hardware.is_first_process():
-            folder = options.runs / loaded.place / arm.name
-            facts = runs.trained_facts(folder)
-            shipping.ship(folder / "last.ckpt", facts, results, start=arm.start, seed=arm.seed)
-            runs.mark_recorded(folder)  # the next run starts from these weights
-        return 0
-
-    sys.exit(_exit_code(run))
-
-
-def _exit_code(run: Callable[[], int]) -> int:
+def exit_code(run: Callable[[], int]) -> int:
     """Call a function; turn what went wrong into a line and an exit code."""
     try:
         code = run()
@@ -129,19 +46,6 @@ def _exit_code(run: Callable[[], int]) -> int:
         return 2
 
 
-def _script_options(experiments: Sequence[str] = ()) -> tuple[Namespace, list[Path]]:
-    """Parse a script's options, those of `run`; list the recipes that it goes through.
-
-    Args:
-        experiments: ids; without any, all of them. --config names one in their place.
-    """
-    options = parse(["run", *sys.argv[1:]])
-    _prepare_output(options)
-    folder = _config_folder() / "exp"
-    listed = [folder / f"{name}.yaml" for name in experiments] or sorted(folder.glob("*.yaml"))
-    return options, [options.config] if options.config else listed
-
-
 def _run_command(words: Sequence[str]) -> int:
     if not words:
         print(SHORT_HELP)
@@ -155,13 +59,13 @@ def _run(options: Namespace) -> int:
     config = _required_config(options)
     from corrmat.training import experiment, recipe
 
-    _prepare_output(options)
+    prepare_output(options)
     loaded = recipe.load(config, options.scale, options.overrides)
     experiment.run(loaded, options.results, options.runs, options.logger, fresh=options.fresh)
     return 0
 
 
-def _fit(options: Namespace) -> int:
+def fit_arm(options: Namespace) -> int:
     """Train one arm."""
     loaded = _load_arm(options)
     from corrmat.files import ensure_writable
@@ -209,7 +113,7 @@ def _load_arm(options: Namespace) -> "Recipe":
     config = _required_config(options)
     from corrmat.training import recipe
 
-    _prepare_output(options)
+    prepare_output(options)
     arms = [options.arm] if options.arm else None
     return recipe.load(config, options.scale, options.overrides, arms)
 
@@ -220,7 +124,7 @@ def _required_config(options: Namespace) -> Path:
     return options.config
 
 
-def _prepare_output(options: Namespace) -> None:
+def prepare_output(options: Namespace) -> None:
     """Choose what is printed while an experiment runs."""
     from corrmat.training import console, fit, hardware
 
@@ -493,14 +397,9 @@ def _completion(options: Namespace) -> int:
     return 0
 
 
-def _config_folder() -> Path:
-    """Return configs/ of the checkout whose script is running."""
-    return Path(sys.argv[0]).resolve().parents[1] / "configs"
-
-
 _COMMANDS: dict[str, Callable[[Namespace], int]] = {
     "run": _run,
-    "fit": _fit,
+    "fit": fit_arm,
     "evaluate": _evaluate,
     "compare": _compare,
     "register": _register,
