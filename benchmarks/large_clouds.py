@@ -8,15 +8,13 @@ other pairs. `phase` is the highest peak of phase correlation between the Manhat
 any network. All are refined by the same generalised ICP, coarse to fine. The record is
 results/register/<protocol>-procedural-20000.json. `choice` in it says, on those other pairs, what
 the candidates of phase correlation and the weights of large clouds are worth
-(`registration/choice.py`; the weights were chosen on further ones). `unrelated` is what
-corrmat makes of sources beside the target of another pair, where no pose is right.
+(`registration/choice.py`; the weights were chosen on further ones).
 """
 
 import argparse
 import functools
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -41,7 +39,7 @@ from corrmat.types import PairBatch
 from corrmat.weights import load_model
 
 RESULTS = Path(__file__).resolve().parents[1] / "results" / "register"
-POINTS, TEST_PAIRS, OTHER_PAIRS, UNRELATED = 20_000, 120, 60, 60
+POINTS, TEST_PAIRS, OTHER_PAIRS = 20_000, 120, 60
 VOXELS = {  # metres, or radii of an object
     "rooms": {
         "ransac": (0.08, 0.12, 0.18, 0.27, 0.4), "kiss": (0.035, 0.05, 0.07, 0.1, 0.15),
@@ -178,11 +176,7 @@ def main() -> None:
     print(benchmark.to_table(results))
     about = {"protocol": protocol, "data": "procedural", "points": POINTS, "pairs": len(pairs)}
     path = RESULTS / f"{protocol}-procedural-{POINTS}.json"
-    strangers = benchmark.compare(benchmark.unrelated(pairs, UNRELATED), ["corrmat"])["corrmat"]
-    more = {
-        "commit": code, "tuning": tried, "choice": choices(others),
-        "unrelated": asdict(strangers),
-    }  # fmt: skip
+    more = {"commit": code, "tuning": tried, "choice": choices(others)}
     write_comparison(path, results, about | more)
 
 

@@ -94,18 +94,38 @@ def test_the_command_prints_one_table_and_writes_a_record(pairs, tmp_path, capsy
     assert "4 pairs of small clouds: expected calibration error over 10 bins 0." in confidence
 
 
+def test_unrelated_pairs_are_spread_and_have_the_target_of_another_pair():
+    pairs = benchmark.frozen_pairs("clean", points=256, count=6)
+    strangers = benchmark.unrelated(pairs, 3)
+    assert torch.equal(strangers.source, pairs.source[[0, 2, 5]])
+    assert torch.equal(strangers.target, pairs.target[[2, 4, 1]])
+    assert len(benchmark.unrelated(pairs, 9)) == 6
+
+
+def test_unrelated_clouds_are_of_different_families():
+    labels = registry.load_clouds("shapes", "test").labels
+    pairs = benchmark.frozen_pairs("clean", points=256)
+    strangers = benchmark.unrelated(pairs, 60)
+    is_same = (strangers.target[:, None] == pairs.target).all((2, 3))
+    assert is_same.sum(1).tolist() == [1] * 60
+    of_target = pairs.shape[is_same.int().argmax(1)]
+    assert (labels[strangers.shape] != labels[of_target]).all()
+
+
 def test_unrelated_pairs_are_counted_below_the_confidence(tmp_path):
-    pairs = benchmark.frozen_pairs("clean", points=256, count=3)
-    strangers = benchmark.unrelated(pairs, 2)
-    assert torch.equal(strangers.source, pairs.source[:2])
-    assert torch.equal(strangers.target, pairs.target[[1, 0]])
-    result = benchmark.summarise(strangers, [benchmark.Outcome(90, 1, 5, 0.0, 0.0, 0.0, 0.0)] * 2)
-    about = {"protocol": "rooms", "points": 256, "unrelated": asdict(result)}
+    pairs = benchmark.unrelated(benchmark.frozen_pairs("clean", points=256, count=3), 2)
+    (tmp_path / "register").mkdir()
+    scores = 0.0, 0.0, 0.0, 0.0
+    result = benchmark.summarise(pairs, [benchmark.Outcome(90, 1, 5, *scores)] * 2)
     write_comparison(
-        tmp_path / "register" / "rooms-procedural-256.json", {"corrmat": result}, about
+        tmp_path / "register" / "rooms-procedural-256.json",
+        {"corrmat": result},
+        {"protocol": "rooms", "points": 256},
     )
+    entry = {"protocol": "rooms", "points": 256, "result": asdict(result)}
+    (tmp_path / comparisons.UNRELATED).write_text(json.dumps({"pairs": [entry, entry]}))
     last = comparisons.confidence_table(tmp_path).splitlines()[-1]
-    assert last == "2 unrelated pairs of rooms: 0 aligned, 0 probably aligned, 2 doubtful."
+    assert last == "4 unrelated pairs of rooms: 0 aligned, 0 probably aligned, 4 doubtful."
 
 
 def test_calibration_intervals_and_paired_test_by_hand():

@@ -127,12 +127,19 @@ def _repeated(points: np.ndarray, count: int) -> np.ndarray:
 
 
 def unrelated(pairs: PairBatch, count: int) -> PairBatch:
-    """Give the sources of the first `count` pairs the target of the pair before: no pose is right.
+    """Put sources beside targets of other pairs, a third of the batch further on: no pose is right.
 
-    The true transforms of the result mean nothing.
+    Neighbours in a batch may be of one family. The true transforms of the result mean nothing.
+
+    Args:
+        pairs: of related clouds.
+        count: of sources, spread evenly over them; at most all.
     """
-    first = {field.name: getattr(pairs, field.name)[:count] for field in fields(pairs)}
-    return PairBatch(**first | {"target": first["target"].roll(1, 0)})
+    chosen = torch.linspace(0, len(pairs) - 1, min(count, len(pairs))).round().long()
+    fields_of = {field.name: getattr(pairs, field.name) for field in fields(pairs)}
+    related = {name: value[chosen] for name, value in fields_of.items()}
+    others = (chosen + max(len(pairs) // 3, 1)) % len(pairs)
+    return PairBatch(**related | {"target": pairs.target[others]})
 
 
 def compare(pairs: PairBatch, models: Sequence[str]) -> dict[str, ModelResult]:

@@ -24,7 +24,7 @@ from corrmat.types import PairBatch
 CALIBRATION_PAIRS = {512: 200, 1024: 100}  # of a protocol, by points of a cloud
 CALIBRATION_PROTOCOLS: tuple[benchmark.Protocol, ...] = ("real", "views", "clean")
 CALIBRATION_SCANS = 150  # pairs of each protocol of large clouds
-CALIBRATION_UNRELATED = 25  # such pairs whose clouds have nothing in common
+CALIBRATION_UNRELATED = 25  # pairs of each kind, one in seven, whose clouds are of two things
 SCAN_POINTS = 20_000
 
 
@@ -93,10 +93,10 @@ def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:
     """Fit the chance that a pair is aligned to its agreement and support.
 
     Logistic regression on held-out pairs of three difficulties, and of large clouds on a curve of
-    their own; `Calibration` applies it. So few large clouds come out wrong that pairs of unrelated
-    ones are added: without them any two would be "probably aligned". The curve over the agreement
-    alone, for models without matches, is fitted on ICP's outcomes as well: most of them are wrong,
-    where few of the network's are.
+    their own; `Calibration` applies it. Pairs of unrelated clouds are added: without them any two
+    rooms, and a third of unrelated objects, would be "probably aligned". The curve over the
+    agreement alone, for models without matches, is fitted on ICP's outcomes as well: most of them
+    are wrong, where few of the network's are.
 
     Args:
         model: as `register` takes it.
@@ -109,25 +109,23 @@ def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:
     agreements, aligned_alone = [], []
     for protocol, points in itertools.product(CALIBRATION_PROTOCOLS, CALIBRATION_PAIRS):
         pairs = held_out_pairs(protocol, CALIBRATION_PAIRS[points], seed=0, points=points)
-        results = benchmark.compare(pairs, [model, "icp"])
-        if points == 512:
-            recalls[protocol] = results[model].recall_5deg
-        scores += results[model].scores
-        aligned += results[model].aligned.tolist()
-        for result in results.values():
-            agreements += result.per_pair["agreement"]
-            aligned_alone += result.aligned.tolist()
-    large_scores: list[tuple[float, ...]] = []
-    large_aligned: list[bool] = []
+        for name in (model, "icp"):
+            recall, more, right = _outcomes(pairs, name)
+            agreements += [each[0] for each in more]
+            aligned_alone += right
+            if name == model:
+                scores += more
+                aligned += right
+                if points == 512:
+                    recalls[protocol] = recall
+    large_scores, large_aligned = [], []
     for protocol in benchmark.SCANS:
         pairs = benchmark.frozen_pairs(
             protocol, points=SCAN_POINTS, count=CALIBRATION_SCANS, split="val"
         )
-        unrelated = benchmark.unrelated(pairs, CALIBRATION_UNRELATED)
-        result, wrong = (benchmark.compare(each, [model])[model] for each in (pairs, unrelated))
-        recalls[protocol] = result.recall_5deg
-        large_scores += result.scores + wrong.scores
-        large_aligned += [*result.aligned.tolist(), *[False] * len(unrelated)]
+        recalls[protocol], more, right = _outcomes(pairs, model)
+        large_scores += more
+        large_aligned += right
     curve = Calibration(
         both=_fit_logistic(np.array(scores)[:, :2].astype(float), np.array(aligned, float)),
         large=_fit_logistic(
@@ -142,6 +140,19 @@ def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:
         called = f"{sure.mean():.1%} of {len(values)} held-out pairs, {wrongly:.1%} wrongly"
         print(f'called "aligned": {called}')
     return asdict(curve), recalls
+
+
+def _outcomes(pairs: PairBatch, model: str) -> tuple[float, list[tuple[float, ...]], list[bool]]:
+    """Register pairs, and some of their clouds with unrelated ones.
+
+    Returns:
+        The share of the pairs that are within 5 degrees; the scores of all, as `SCORES`; and
+        whether they are aligned, which unrelated clouds never are.
+    """
+    strangers = benchmark.unrelated(pairs, CALIBRATION_UNRELATED)
+    result, wrong = (benchmark.compare(each, [model])[model] for each in (pairs, strangers))
+    aligned = [*result.aligned.tolist(), *[False] * len(strangers)]
+    return result.recall_5deg, result.scores + wrong.scores, aligned
 
 
 def held_out_pairs(

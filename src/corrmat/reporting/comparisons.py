@@ -17,6 +17,7 @@ from corrmat.weights import shipped_metadata
 
 OURS = "corrmat"
 TRAINING = Path("register", "training.json")  # below results/: how the shipped weights were trained
+UNRELATED = Path("register", "unrelated.json")  # what they make of clouds of two different things
 _PROTOCOLS = ("real", "views", "clean", "dense", "rooms")  # in the order of the tables
 _SMALL = "real", "views", "clean"  # clouds of at most 1,024 points
 # Protocols of each kind of clouds.
@@ -176,7 +177,7 @@ def confidence_table(results: Path) -> str:
     """
     heads = ["verdict", "data", "pairs", "promised", "aligned", "wrong"]
     lines, summaries = markdown_head(heads), []
-    comparisons = _read_comparisons(results)
+    comparisons, unrelated = _read_comparisons(results), _read_unrelated(results)
     for what, protocols in _KINDS.items():
         both = []
         records = [c for c in comparisons if c.protocol in protocols]
@@ -200,8 +201,10 @@ def confidence_table(results: Path) -> str:
             low, high = error_of_the_perfect(promised)
             perfect = f"a perfect confidence would show {low:.3f} to {high:.3f} on so many"
             summaries += ["", f"{len(promised)} pairs of {what}: {text} ({perfect})."]
-        for unrelated in filter(None, (record.unrelated for record in records)):
-            verdicts = _verdicts(_confidence(unrelated)).tolist()
+        strangers = [result for protocol, result in unrelated if protocol in protocols]
+        if strangers:
+            confidence = np.concatenate([_confidence(result) for result in strangers])
+            verdicts = _verdicts(confidence).tolist()
             counts = ", ".join(f"{verdicts.count(words)} {words}" for words in _VERDICTS)
             summaries += ["", f"{len(verdicts)} unrelated pairs of {what}: {counts}."]
     return "\n".join(lines + summaries)
@@ -301,6 +304,13 @@ def _read_comparisons(results: Path) -> list[Comparison]:
     records = map(read_comparison, (results / "register").glob("*-*-*.json"))
     kept = [record for record in records if record.protocol in _PROTOCOLS]
     return sorted(kept, key=lambda r: (_PROTOCOLS.index(r.protocol), r.data, r.points))
+
+
+def _read_unrelated(results: Path) -> list[tuple[str, ModelResult]]:
+    """Read what our model makes of unrelated clouds, by protocol."""
+    path = results / UNRELATED
+    content = json.loads(path.read_text())["pairs"] if path.is_file() else []
+    return [(entry["protocol"], ModelResult(**entry["result"])) for entry in content]
 
 
 def _verdicts(confidence: np.ndarray) -> np.ndarray:

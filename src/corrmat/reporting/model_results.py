@@ -51,7 +51,6 @@ class Comparison:
     data: str
     points: int  # of a cloud before it is cropped
     models: dict[str, ModelResult]
-    unrelated: ModelResult | None = None  # of clouds that have nothing in common, our model's
 
 
 def write_comparison(
@@ -75,7 +74,6 @@ def read_comparison(path: Path) -> Comparison:
     """Read the record of a comparison."""
     content = json.loads(path.read_text())
     models = {name: ModelResult(**result) for name, result in content["models"].items()}
-    unrelated = ModelResult(**content["unrelated"]) if "unrelated" in content else None
     # A comparison of several data sets names none.
     data = content.get("data", "")
-    return Comparison(content["protocol"], data, content["points"], models, unrelated)
+    return Comparison(content["protocol"], data, content["points"], models)
