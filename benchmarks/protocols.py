@@ -10,19 +10,19 @@ import sys
 from pathlib import Path
 
 from corrmat.cli import main
+from corrmat.registration.benchmark import PROTOCOLS, TABLE_POINTS
 
 RESULTS = Path(__file__).resolve().parents[1] / "results" / "register"
 MODELS = "corrmat,ransac,ransac17,fgr,kiss,icp"
 NETWORKS = "corrmat,2.2/RPMNet_corr,outliers/DCP_corr"
-POINTS = {"real": (512, 1024), "views": (512,), "clean": (512, 1024)}
 
 
 def run(root: Path | None) -> None:
     """Evaluate and record each of them; the real data only where they are at hand."""
     compare(NETWORKS, "networks", [])
     for data in ("shapes", *(("modelnet40",) if root else ())):
-        for protocol, sizes in POINTS.items():
-            for points in sizes:
+        for protocol in filter(PROTOCOLS.__contains__, TABLE_POINTS):
+            for points in TABLE_POINTS[protocol]:
                 name = f"{protocol}-{data}-{points}"
                 words = ["--protocol", protocol, "--data", data, "--points", str(points)]
                 words += ["--root", str(root)] if data == "modelnet40" else []

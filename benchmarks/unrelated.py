@@ -17,16 +17,12 @@ from corrmat.revision import commit
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
 PAIRS = 60  # of each protocol and size
-POINTS: dict[benchmark.Protocol, tuple[int, ...]] = {
-    "real": (512, 1024), "views": (512,), "clean": (512, 1024), "dense": (20_000,),
-    "rooms": (20_000,),
-}  # fmt: skip
 
 
 def main() -> None:
     """Register the pairs of every protocol."""
     code, entries = commit(), []
-    for protocol, sizes in POINTS.items():
+    for protocol, sizes in benchmark.TABLE_POINTS.items():
         for points in sizes:
             pairs = benchmark.unrelated(benchmark.frozen_pairs(protocol, points=points), PAIRS)
             result = benchmark.compare(pairs, ["corrmat"])["corrmat"]

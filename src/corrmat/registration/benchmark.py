@@ -43,6 +43,10 @@ PROTOCOLS: dict[Protocol, PairSettings] = {
 SCANS: dict[Protocol, Callable[[int, int, Split], ScanPair]] = {
     "dense": make_object_pair, "rooms": make_room_pair,
 }  # fmt: skip
+TABLE_POINTS: dict[Protocol, tuple[int, ...]] = {  # of a cloud, in the tables of the documents
+    "real": (512, 1024), "views": (512,), "clean": (512, 1024), "dense": (20_000,),
+    "rooms": (20_000,),
+}  # fmt: skip
 COLUMNS = {
     "mean_deg": "mean °",
     "median_deg": "median °",

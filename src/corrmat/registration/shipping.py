@@ -106,18 +106,17 @@ def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:
         and of large clouds, that are within 5 degrees.
     """
     scores, aligned, recalls = [], [], {}
-    agreements, aligned_alone = [], []
+    icp_scores, icp_aligned = [], []
     for protocol, points in itertools.product(CALIBRATION_PROTOCOLS, CALIBRATION_PAIRS):
         pairs = held_out_pairs(protocol, CALIBRATION_PAIRS[points], seed=0, points=points)
-        for name in (model, "icp"):
-            recall, more, right = _outcomes(pairs, name)
-            agreements += [each[0] for each in more]
-            aligned_alone += right
-            if name == model:
-                scores += more
-                aligned += right
-                if points == 512:
-                    recalls[protocol] = recall
+        recall, more, right = _outcomes(pairs, model)
+        if points == 512:
+            recalls[protocol] = recall
+        scores += more
+        aligned += right
+        _, more, right = _outcomes(pairs, "icp")
+        icp_scores += more
+        icp_aligned += right
     large_scores, large_aligned = [], []
     for protocol in benchmark.SCANS:
         pairs = benchmark.frozen_pairs(
@@ -132,7 +131,10 @@ def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:
             np.array([of_large_clouds(*each[1:]) for each in large_scores]),
             np.array(large_aligned, float),
         ),
-        agreement=_fit_logistic(np.array(agreements)[:, None], np.array(aligned_alone, float)),
+        agreement=_fit_logistic(
+            np.array([each[:1] for each in scores + icp_scores]),
+            np.array(aligned + icp_aligned, float),
+        ),
     )
     for values, right in ((scores, aligned), (large_scores, large_aligned)):
         sure = np.array([curve.confidence(*each) >= SURE for each in values])
