@@ -2,6 +2,7 @@ import subprocess
 import sys
 from typing import get_args
 
+import numpy as np
 import pytest
 from conftest import ROOT
 
@@ -277,3 +278,26 @@ def test_a_checkpoint_of_another_scale_is_named(tmp_path, capsys):
     assert "there is one of --scale smoke" in capsys.readouterr().err
     assert main(["evaluate", *words, *options, "--seed", "1"]) == 2
     assert "train first" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("scans", [["line.xyz", "good.xyz"], ["good.xyz", "line.xyz", "good.xyz"]])
+def test_an_error_in_the_points_names_the_file(scans, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    points = np.random.default_rng(0).random((50, 3))
+    np.savetxt("good.xyz", points)
+    np.savetxt("line.xyz", points[:, :1] * np.ones(3))
+    assert main(["register", *scans]) == 2
+    assert "line.xyz: all points lie on one line" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("command", "default"), [("register", "corrmat"), ("compare", "real")])
+def test_help_says_what_an_option_is_by_default(command, default, capsys):
+    with pytest.raises(SystemExit, match="0"):
+        main([command, "--help"])
+    assert f"(default: {default})" in " ".join(capsys.readouterr().out.split())
+
+
+def test_help_of_a_script_says_what_the_script_does():
+    words = [sys.executable, ROOT / "reproduce" / "checkpoints.py", "--help"]
+    shown = subprocess.run(words, capture_output=True, text=True).stdout
+    assert shown.startswith("The trained arms of recorded experiments")

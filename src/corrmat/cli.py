@@ -14,6 +14,8 @@ from corrmat.errors import CorrmatError
 from corrmat.options import EXPERIMENT_COMMANDS, SHORT_HELP, build_parser, parse
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from corrmat.training.recipe import Recipe
 
 _STDOUT = Path("-")  # as a file to write
@@ -229,11 +231,11 @@ def _refuse_folder(path: Path) -> None:
 
 def _register_pair(options: Namespace) -> str:
     """Register one file onto another; return the result as JSON."""
-    from corrmat.data.scans import read_scan, write_moved
+    from corrmat.data.scans import write_moved
     from corrmat.files import replace_bytes, replace_text
 
     names = str(options.source[0]), str(options.target)
-    source, target = (read_scan(name, options.seed) for name in names)
+    source, target = _read_scans(options)
     from corrmat.registration.register import register
     from corrmat.registration.result import to_json, to_text
 
@@ -259,6 +261,18 @@ def _register_pair(options: Namespace) -> str:
     return content
 
 
+def _read_scans(options: Namespace) -> "list[np.ndarray]":
+    """Read all scans; an error in their points, too, names the file."""
+    from corrmat.data.scans import read_scan
+    from corrmat.registration.preparation import Cloud
+
+    paths = *options.source, options.target
+    scans = [read_scan(path, options.seed) for path in paths]
+    for path, scan in zip(paths, scans, strict=True):
+        Cloud.of(scan, str(path), options.seed)
+    return scans
+
+
 def _write_json(path: Path | None, content: str) -> None:
     """Write a result to the file that --json names; standard output comes last."""
     from corrmat.files import replace_text
@@ -272,9 +286,9 @@ def _register_several(options: Namespace) -> str:
     """Register several files onto one; return the result as JSON."""
     if options.html or options.gif:
         raise CorrmatError("--html and --gif show two scans; --output moves several, to look at")
-    from corrmat.data.scans import read_scan, write_moved
+    from corrmat.data.scans import write_moved
 
-    scans = [read_scan(path, options.seed) for path in (*options.source, options.target)]
+    scans = _read_scans(options)
     from corrmat.registration import pose_graph
 
     poses = pose_graph.register_scans(

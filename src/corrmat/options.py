@@ -101,7 +101,9 @@ exit codes: 0 done, whatever the verdict; 2 a file cannot be used, and one line 
 Scale = Literal["smoke", "laptop", "overnight", "paper"]
 Logger = Literal["none", "csv", "wandb"]
 Protocol = Literal["paper", "real", "views", "clean", "dense", "rooms"]
-RESULTS_HELP = "folder of the records"
+DEFAULT = "(default: %(default)s)"  # argparse fills it in
+RESULTS_HELP = f"folder of the records {DEFAULT}"
+SEED_HELP = f"seed of the random draws {DEFAULT}"
 EXPERIMENT_COMMANDS = ("run", "fit", "evaluate")
 
 
@@ -216,17 +218,18 @@ def build_parser(with_settings: Sequence[str] = ()) -> ArgumentParser:
     )  # fmt: skip
     export.add_argument("folder", type=Path, help="for model.safetensors, config.json, README.md")
     export.add_argument(
-        "--model", default="corrmat", help="corrmat, 1.2/DCP_corr, ..., or a checkpoint file"
-    )
+        "--model", default="corrmat",
+        help=f"corrmat, 1.2/DCP_corr, ..., or a checkpoint file {DEFAULT}",
+    )  # fmt: skip
     example = add("example", "write two scans to try register on", words="FOLDER")
     example.add_argument("folder", type=Path, help="for source.ply, target.ply and truth.json")
     robustness = add("robustness", "figure 2: wrong matches against a wrong rotation vector")
     robustness.add_argument(
         "--scale", type=Scale, default="laptop",
-        help="smoke: 20 draws a point of a curve instead of 400",
+        help=f"smoke: 20 draws a point of a curve instead of 400 {DEFAULT}",
     )  # fmt: skip
     robustness.add_argument("--results", type=Path, default=Path("results"), help=RESULTS_HELP)
-    robustness.add_argument("--seed", type=_count, default=0, help="seed of the random draws")
+    robustness.add_argument("--seed", type=_count, default=0, help=SEED_HELP)
     data = add(
         "data", "make the embedded data set, or fetch ModelNet40",
         "examples:\n  corrmat data --sheet a.png\n  corrmat data modelnet40 --root /data",
@@ -257,12 +260,17 @@ def _add_experiment_options(
 ) -> None:
     """Add the options of run, fit and evaluate."""
     parser.add_argument("--config", type=Path, help="the experiment, e.g. configs/exp/1.1.yaml")
-    parser.add_argument("--scale", type=Scale, default="laptop", help="how large, how long")
-    parser.add_argument("--runs", type=Path, default=Path("runs"), help="folder of checkpoints")
+    parser.add_argument(
+        "--scale", type=Scale, default="laptop", help=f"how large, how long {DEFAULT}"
+    )
+    parser.add_argument(
+        "--runs", type=Path, default=Path("runs"), help=f"folder of checkpoints {DEFAULT}"
+    )
     if name in ("run", "fit"):
         parser.add_argument(
             "--logger", type=Logger, default="wandb",
-            help="wandb: CSV and wandb offline; csv; none. The record is written in any case",
+            help="wandb: CSV and wandb offline; csv; none. The record is written in any case "
+            f"{DEFAULT}",
         )  # fmt: skip
         parser.add_argument(
             "--fresh", action="store_true",
@@ -289,15 +297,17 @@ def _add_experiment_options(
 def _add_compare_options(parser: ArgumentParser) -> None:
     """Add the options of compare."""
     parser.add_argument("models", help="e.g. corrmat,ransac,fgr,icp or checkpoint files")
-    parser.add_argument("--protocol", type=Protocol, default="real", help="see below")
+    parser.add_argument("--protocol", type=Protocol, default="real", help=f"see below {DEFAULT}")
     parser.add_argument(
-        "--data", default="shapes", help="shapes, assemblies, rooms, modelnet40 or folder"
-    )
+        "--data", default="shapes",
+        help=f"shapes, assemblies, rooms, modelnet40 or folder {DEFAULT}",
+    )  # fmt: skip
     parser.add_argument("--root", type=Path, help="folder of the data set")
     parser.add_argument(
-        "--points", type=_positive, default=512, help="points of a cloud before it is cropped"
-    )
-    parser.add_argument("--pairs", type=_positive, default=120, help="number of pairs")
+        "--points", type=_positive, default=512,
+        help=f"points of a cloud before it is cropped {DEFAULT}",
+    )  # fmt: skip
+    parser.add_argument("--pairs", type=_positive, default=120, help=f"number of pairs {DEFAULT}")
     parser.add_argument(
         "--record", type=Path, metavar="JSON", help="write the table and the values of each pair"
     )
@@ -322,12 +332,14 @@ def _add_register_options(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--model", default="corrmat",
         help="corrmat (the shipped weights), icp, ransac, ransac17, fgr, kiss, a shipped arm "
-        "(1.2/DCP_corr), a checkpoint file, a folder of corrmat export, or hf:name/model",
+        "(1.2/DCP_corr), a checkpoint file, a folder of corrmat export, or hf:name/model "
+        f"{DEFAULT}",
     )  # fmt: skip
     parser.add_argument(
-        "--refine", type=Literal["icp", "none"], default="icp", help="refinement after the model"
-    )
-    parser.add_argument("--seed", type=_count, default=0, help="seed of the random draws")
+        "--refine", type=Literal["icp", "none"], default="icp",
+        help=f"refinement after the model {DEFAULT}",
+    )  # fmt: skip
+    parser.add_argument("--seed", type=_count, default=0, help=SEED_HELP)
 
 
 def _count(text: str) -> int:

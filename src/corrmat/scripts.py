@@ -71,7 +71,7 @@ def train_weights() -> None:
 
     def run() -> int:
         words = ["fit", "--config", str(_config_folder() / "weights.yaml"), *sys.argv[1:]]
-        options = parse(words)
+        options = _parse(words)
         from corrmat.registration import shipping
         from corrmat.training import hardware, recipe, runs
 
@@ -99,11 +99,18 @@ def _script_options(experiments: Sequence[str] = ()) -> tuple[Namespace, list[Pa
     Args:
         experiments: ids; without any, all of them. --config names one in their place.
     """
-    options = parse(["run", *sys.argv[1:]])
+    options = _parse(["run", *sys.argv[1:]])
     prepare_output(options)
     folder = _config_folder() / "exp"
     listed = [folder / f"{name}.yaml" for name in experiments] or sorted(folder.glob("*.yaml"))
     return options, [options.config] if options.config else listed
+
+
+def _parse(words: Sequence[str]) -> Namespace:
+    """Parse a command's words; --help says first what the script does."""
+    if {"-h", "--help"} & set(words):
+        print(f"{sys.modules['__main__'].__doc__}\nIts options are those of corrmat {words[0]}:\n")
+    return parse(words)
 
 
 def _config_folder() -> Path:
