@@ -289,7 +289,7 @@ def draw_matches(
         _draw_scene(axes, scene, has_matches=has_matches)
         axes.set_title(heading, fontsize="medium")
     handles, labels = figure.axes[-1].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize="small")
+    figure.legend(handles, labels, loc="outside lower center", ncols=5, fontsize="small")
     save(figure, path)
 
 
@@ -306,12 +306,12 @@ def _draw_scene(axes: Axes, scene: Stage, *, has_matches: bool) -> None:
         axes.add_collection(_match_lines(scene, source, target))
     axes.scatter(*target.T, s=18, color="#9ecae9", linewidths=0, label="target")
     axes.scatter(*source.T, s=4, color="black", linewidths=0, label="source")
-    outlier = scene.called_outlier
-    if outlier.any():
-        rings = np.where(scene.correct[outlier], GREEN, RED).tolist()
-        axes.scatter(
-            *source[outlier].T, s=60, facecolors="none", edgecolors=rings, label="called outlier"
-        )
+    for right, colour in ((True, GREEN), (False, RED)):
+        called = scene.called_outlier & (scene.correct == right)
+        if called.any():
+            label = f"called outlier, {'rightly' if right else 'wrongly'}"
+            rings = {"s": 60, "facecolors": "none", "edgecolors": colour, "label": label}
+            axes.scatter(*source[called].T, **rings)
     axes.set_aspect("equal")
     axes.set_axis_off()
 
