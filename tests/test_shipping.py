@@ -37,7 +37,7 @@ def package(tmp_path, monkeypatch):
     monkeypatch.setattr(shipping, "CALIBRATION_SCANS", 2)
     monkeypatch.setattr(shipping, "CALIBRATION_UNRELATED", 2)
     monkeypatch.setattr(shipping, "SCAN_POINTS", 6000)
-    monkeypatch.setattr("corrmat.data.shapes.dataset.SIZE", {"train": 200, "test": 10})
+    monkeypatch.setattr("corrmat.data.shapes.dataset.SIZE", {"train": 80, "test": 10})
     monkeypatch.setattr("corrmat.data.shapes.dataset.ASSEMBLIES", {"train": 20, "test": 10})
     return copy
 
@@ -83,7 +83,10 @@ def test_nothing_is_shipped_before_its_calibration_is_done(checkpoint, package, 
     assert [path.name for path in package.parent.iterdir()] == [package.name]
 
 
-def test_weights_that_start_from_others_have_only_their_own_pairs(checkpoint, package, tmp_path):
+def test_weights_that_start_from_others_have_only_their_own_pairs(
+    checkpoint, package, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(shipping, "calibrate", lambda model: ({}, {}))
     shipping.ship(checkpoint, FACTS, tmp_path / "results", start=None, seed=7)
     assert int(weights.shipped_metadata()["pairs"]) == 400
     shipping.refuse_used_seed(tmp_path / "results", 8)
@@ -109,6 +112,8 @@ def test_the_calibration_finds_the_chance_that_made_the_pairs():
 
 def test_the_verification_network_is_trained_goes_on_and_ships(package, tmp_path, monkeypatch):
     """Smoke: two steps; the second call finds the candidates made and the training done."""
+    calibrated = []
+    monkeypatch.setattr(verification_training, "recalibrate", lambda: calibrated.append(True))
     monkeypatch.setattr(verification_training, "BATCH_PAIRS", 1)
     options = {"runs": tmp_path / "runs", "data": "shapes", "pairs": 6, "steps": 2, "workers": 0}
     assert load_verification(load_model()) is None
@@ -121,3 +126,4 @@ def test_the_verification_network_is_trained_goes_on_and_ships(package, tmp_path
     assert made == {path: path.stat().st_mtime_ns for path in made}
     again = load_verification(load_model())
     assert all(map(torch.equal, verification.parameters(), again.parameters()))
+    assert calibrated == [True, True]

@@ -90,7 +90,8 @@ class Evidence:
 def read_evidence(record: Record, results: Path) -> Evidence:
     """Read what a claim needs of a record's folder."""
     folder = results / record.place
-    config = yaml.safe_load((folder / "config.yaml").read_text())
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times as fast, where it is built
+    config = yaml.load((folder / "config.yaml").read_text(), loader)
     data = config["arms"][record.treatment]["data"]
     # The angle is uniform, so its median is half of the largest.
     largest = record.bands_deg[-1] if record.bands_deg else float(data["rotation_deg"])

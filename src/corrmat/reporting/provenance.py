@@ -61,13 +61,15 @@ def staleness(record: Record, repository: Path) -> str:
         if diff.returncode:
             return f"commit {name} is not at hand, so nobody can tell whether the code has changed"
         for path in diff.stdout.split():
-            then, now = git(repository, "show", f"{name}:./{path}"), repository / path
-            if then.returncode or not now.exists():
+            then, now = _text_at(repository, name, path), repository / path
+            if then is None or not now.exists():
                 changed.add(now.name)
                 continue
-            before, after = (
-                _meaning(path, t, record.scale) for t in (then.stdout, now.read_text())
-            )
+            texts = then, now.read_text()
+            if path.endswith(".yaml"):
+                before, after = (_training_settings(text, record.scale) for text in texts)
+            else:
+                before, after = map(_code, texts)
             if before != after:
                 changed.add(now.name)
     return f"changed since: {', '.join(sorted(changed))}" if changed else ""
@@ -121,17 +123,31 @@ def _path(module: str) -> Path | None:
     return path if path.is_file() else None
 
 
-@functools.cache  # records share most of their code and commits
-def _meaning(name: str, text: str, scale: str) -> object:
-    """Parse a recipe, as far as it decides how arms train at a scale, or a module.
+# Records share most of their code and commits: hence the caches.
 
-    Comments, docstrings, and a recipe's baselines and expected numbers are left out.
+
+@functools.cache
+def _text_at(repository: Path, commit: str, path: str) -> str | None:
+    """Return a file's content at a commit; None if it has no such file."""
+    shown = git(repository, "show", f"{commit}:./{path}")
+    return None if shown.returncode else shown.stdout
+
+
+@functools.cache
+def _training_settings(recipe: str, scale: str) -> object:
+    """Parse a recipe, as far as it decides how arms train at a scale.
+
+    Its baselines and expected numbers are left out.
     """
-    if name.endswith(".yaml"):
-        recipe = yaml.safe_load(text)
-        layer = (recipe.get("scales") or {}).get(scale)
-        return {k: v for k, v in recipe.items() if k not in _NOT_TRAINING} | {"scales": layer}
-    tree = ast.parse(text)
+    content = yaml.safe_load(recipe)
+    layer = (content.get("scales") or {}).get(scale)
+    return {k: v for k, v in content.items() if k not in _NOT_TRAINING} | {"scales": layer}
+
+
+@functools.cache
+def _code(module: str) -> str:
+    """Parse a module; comments, docstrings and formatting are left out."""
+    tree = ast.parse(module)
     for node in ast.walk(tree):
         documented = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
         if documented and ast.get_docstring(node, clean=False) is not None:
