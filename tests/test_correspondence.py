@@ -25,6 +25,17 @@ def test_nll_is_the_papers_formula_in_value_and_gradient(generator):
         torch.testing.assert_close(a, b)
 
 
+@pytest.mark.parametrize("first", ["argmax", "weight", "prob", "logits"])
+def test_what_was_read_without_gradients_has_them_in_the_loss(first, generator):
+    f_x, f_y, index = features(generator)
+    expected = torch.autograd.grad(correspondence_loss(SoftCorrespondence(f_x, f_y), index), f_x)
+    c = SoftCorrespondence(f_x, f_y)
+    with torch.no_grad():
+        getattr(c, first)()
+    torch.testing.assert_close(torch.autograd.grad(correspondence_loss(c, index), f_x), expected)
+    assert c.prob().requires_grad
+
+
 def test_rows_are_distributions_and_the_rest_follows_from_them(generator):
     f_x, f_y, _ = features(generator)
     c = SoftCorrespondence(f_x, f_y, 0.5)

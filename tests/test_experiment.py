@@ -420,6 +420,7 @@ def test_nothing_is_deleted_or_trained_when_the_test_split_cannot_be_read(tmp_pa
         ("--trainer.limit_train_batches 0.01", "leaves nothing to do"),
         ("--trainer.limit_val_batches 0.01", "leaves nothing to do"),
         ("--trainer.fast_dev_run true", "fast_dev_run does not go with records"),
+        ("--trainer.sync_batchnorm true", "sync_batchnorm does not go with records"),
         ("--trainer.overfit_batches 1", "overfit_batches does not go with records"),
         ("--trainer.val_check_interval 00:01:00:00", "is not a number of batches"),
         ("--trainer.val_check_interval 10 --trainer.check_val_every_n_epoch 1", "never comes"),

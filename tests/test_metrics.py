@@ -135,6 +135,9 @@ def test_no_answer_is_counted_and_never_scored_as_one(batch):
     values = scores.compute()
     assert values["failed"] == 1
     assert math.isnan(values["rotation_error_deg_mean"])
+    assert values["rotation_error_deg_median"] == pytest.approx(
+        0, abs=1e-3
+    )  # it is 180 degrees off
     assert values["recall@5deg_0.05"] == pytest.approx(5 / 6)
 
 

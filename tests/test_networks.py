@@ -11,13 +11,15 @@ from twins import (
     std_norm,
 )
 
+from corrmat.errors import CorrmatError
 from corrmat.methods import DCP, METHODS, DCPCorr
 from corrmat.networks.attention import Attention, StdNorm, Transformer
 from corrmat.networks.dcp import DCPNetwork
 from corrmat.networks.dgcnn import DGCNN, EdgeConvolution, edge_features
+from corrmat.networks.invariant import InvariantNetwork
 from corrmat.networks.pointnet import shared_mlp
 from corrmat.networks.ppf import neighborhoods
-from corrmat.networks.rpmnet import NeighborhoodNet
+from corrmat.networks.rpmnet import NeighborhoodNet, RPMNetwork
 from corrmat.ops import edge_mlp
 from corrmat.ops.neighbors import knn
 from corrmat.types import PairBatch
@@ -264,3 +266,17 @@ def test_the_maximum_over_very_many_points_has_its_gradient():
     torch.testing.assert_close(fused, plain, rtol=1e-4, atol=1e-5)
     (expected,) = torch.autograd.grad(plain.sum(), edges)
     torch.testing.assert_close(grad, expected, rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("network", "option", "value"),
+    [
+        (InvariantNetwork, "layers", -1),
+        (InvariantNetwork, "shares", ()),
+        (InvariantNetwork, "shares", (0.1, 2.0)),
+        (RPMNetwork, "radius", -1.0),
+    ],
+)
+def test_options_that_make_no_network_are_refused(network, option, value):
+    with pytest.raises(CorrmatError, match=option):
+        network(**{option: value})

@@ -269,6 +269,7 @@ def test_every_epoch_has_new_shapes_of_the_same_categories(monkeypatch):
     items = [(epoch, shape) for epoch in range(2) for shape in (0, 1, 80)]
     shapes = np.concatenate([dataset[item].clean.numpy() for item in items])
     assert made == [known.names[known.labels[shape]] for _, shape in items]
+    assert [dataset[item].shape.item() for item in items] == [shape for _, shape in items]
     again = np.concatenate([dataset[item].clean.numpy() for item in items])
     np.testing.assert_array_equal(shapes, again)
     everything = np.concatenate([known.rows[:, :, :3], shapes]).reshape(len(known) + 6, -1)

@@ -227,6 +227,7 @@ ONE_ARM = "id: x\ntitle: t\narms: {DCP: {}}\n"
         ("id: x\ntitle: t\narms: {DCP: {}, DCP_corr: {}}\n", "lacks 'treatment'"),
         (ONE_ARM + "bands_deg: 30\n", "bands_deg must be a list"),
         (ONE_ARM + "scales: [laptop]\n", "scales must be names"),
+        (ONE_ARM + "scales: {paper: {}}\n", "has no scale smoke, but paper"),
         ("id: x\ntitle: t\n", "lacks 'arms'"),
         ("id: x\ntitle: t\nbase: nowhere.yaml\n", "no recipe .*nowhere.yaml"),
     ],

@@ -16,6 +16,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 import corrmat
+from corrmat import weights
 from corrmat.baselines import fpfh_ransac
 from corrmat.calibration import SURE, verdict
 from corrmat.cli import main
@@ -660,8 +661,15 @@ def test_a_network_keeps_its_mode_and_must_not_predict_nonsense():
 
 def test_only_the_shipped_weights_have_a_calibrated_confidence(pair):
     _, source, target, _ = pair
-    texts = [result.to_text(corrmat.register(source, target, model=m)) for m in ("corrmat", "icp")]
-    assert ["fitted to the shipped weights" in text for text in texts] == [False, True]
+    ways = {"model": "corrmat"}, {"model": "icp"}, {"refine": "none"}
+    texts = [result.to_text(corrmat.register(source, target, **way)) for way in ways]
+    assert ["fitted to the shipped weights" in text for text in texts] == [False, True, True]
+
+
+def test_the_verification_network_registers_nothing_alone(pair):
+    verification = weights.SHIPPED.with_name("verification.safetensors")
+    with pytest.raises(CorrmatError, match="registers nothing alone"):
+        corrmat.register(*pair[1:3], model=verification)
 
 
 def test_rough_agreement_is_that_of_all_distances(generator):

@@ -103,6 +103,15 @@ def test_the_names_of_columns_say_which_are_the_coordinates(tmp_path, header):
     assert np.abs(read_scan(tmp_path / "table.csv") - POINTS).max() < 1e-12
 
 
+def test_a_header_and_rows_of_other_lengths_are_refused(tmp_path):
+    """Decimal commas, or names that have slipped: whatever is meant, it cannot be guessed."""
+    (tmp_path / "table.csv").write_text("x,y,z\n1,5,2,5,3,5\n4,5,1,5,2,5\n")
+    with pytest.raises(CorrmatError, match="names 3 columns, the first row has 6"):
+        read_scan(tmp_path / "table.csv")
+    (tmp_path / "table.csv").write_text("x,y,z\n1,2,3,\n4,5,6,\n")  # as some programs end rows
+    assert read_scan(tmp_path / "table.csv").tolist() == [[1, 2, 3], [4, 5, 6]]
+
+
 def test_an_array_that_lies_on_its_side_is_not_three_points(tmp_path):
     np.save(tmp_path / "side.npy", POINTS.T)
     with pytest.raises(CorrmatError, match="transpose it"):

@@ -245,14 +245,15 @@ class RegistrationMetrics(Metric):
 def summary(per_pair: dict[str, Tensor]) -> dict[str, float]:
     """Summarise many pairs: angles in degrees, lengths in units of the unit sphere.
 
-    A pair without a finite rotation counts in `failed`, makes means NaN and is a miss in recall.
+    A pair without a finite rotation counts in `failed`, as 180 degrees in the median, makes means
+    NaN and is a miss in recall.
     """
     angle, shift = per_pair["rotation_error_deg"], per_pair["translation_error"]
     relative, naive = per_pair["relative_euler_error_deg"], per_pair["naive_euler_error_deg"]
     recalled = (angle < RECALL_DEG) & (shift < RECALL_UNITS)
     values = {
         "rotation_error_deg_mean": angle.mean(),
-        "rotation_error_deg_median": angle.median(),
+        "rotation_error_deg_median": angle.nan_to_num(nan=180.0).median(),
         "relative_euler_rmse_deg": relative.square().mean().sqrt(),
         "relative_euler_mae_deg": relative.abs().mean(),
         "naive_euler_rmse_deg": naive.square().mean().sqrt(),

@@ -122,7 +122,10 @@ def load_model(model: str | Path = "corrmat") -> nn.Module:
     """
     file = _safetensors_file(str(model))
     if file is not None:
-        return _load_safetensors(file)
+        network = _load_safetensors(file)
+        if isinstance(network, VerificationNetwork):
+            raise CorrmatError(f"{model} judges candidates of corrmat; it registers nothing alone")
+        return network
     path = Path(model)
     content = _read_checkpoint(path)
     if "method" in content:

@@ -69,7 +69,8 @@ class PairDataset(Dataset[PairBatch]):
             for label, key in zip(labels, keys, strict=True)
         ]
         clouds = CloudSet(np.stack(rows), labels, self.clouds.names)
-        return make_pairs(clouds, range(len(rows)), keys, self.settings)
+        pairs = make_pairs(clouds, range(len(rows)), keys, self.settings)
+        return replace(pairs, shape=torch.as_tensor(shapes))
 
 
 class EpochSampler(Sampler[tuple[int, int]]):

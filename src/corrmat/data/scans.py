@@ -312,6 +312,11 @@ def _text(path: Path) -> np.ndarray:
             )
         columns = [names.index(axis) for axis in "xyz"]
         del lines[0]
+        cells = _cells(lines[0], separator) if lines else names
+        if len(cells) != len(names) and any(cells[len(names) :]):
+            raise CorrmatError(
+                f"{path}: the header names {len(names)} columns, the first row has {len(cells)}"
+            )
     for comment in comments:
         names = re.split(r"[;,\s]+", comment.lstrip("# ").lower())
         if _XYZ.issubset(names) and len(names) == len(first):

@@ -10,7 +10,7 @@ attention uses them as GeoTransformer does between superpoints (Qin et al., CVPR
 import torch
 from torch import Tensor, nn
 
-from corrmat.errors import require_positive
+from corrmat.errors import CorrmatError, require_positive
 from corrmat.networks.attention import Attention, FeedForward
 from corrmat.networks.matching import Matchability
 from corrmat.networks.ppf import SIGNLESS, signless_pair_features
@@ -48,6 +48,10 @@ class InvariantNetwork(nn.Module):
             width=width, heads=heads, anchors=anchors, test_anchors=test_anchors,
             neighbors=neighbors,
         )  # fmt: skip
+        if layers < 0:
+            raise CorrmatError(f"layers {layers} is negative")
+        if not shares or not all(0 < share <= 1 for share in shares):
+            raise CorrmatError(f"shares {shares} are not in (0, 1]")
         self.min_points = 3
         self.anchors, self.test_anchors = anchors, test_anchors
         self.neighbors, self.shares = neighbors, shares

@@ -58,6 +58,8 @@ class RPMNetwork(nn.Module):
             k=k, iterations=iterations, test_iterations=test_iterations,
             sinkhorn_iterations=sinkhorn_iterations,
         )  # fmt: skip
+        if not radius > 0:
+            raise CorrmatError(f"radius {radius} is not positive")
         self.k, self.radius = k, radius
         self.iterations, self.test_iterations = iterations, test_iterations
         self.sinkhorn_iterations = sinkhorn_iterations

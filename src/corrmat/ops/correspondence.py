@@ -1,6 +1,8 @@
 """The soft correspondence matrix: every source point an example, every target point a class."""
 
 import functools
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -9,6 +11,19 @@ from torch import Tensor
 from corrmat.ops.neighbors import gather_points
 from corrmat.ops.sinkhorn import Slack, sinkhorn_potentials
 from corrmat.ops.streaming import argmax_rows, log_sums, softmax_rows
+
+T = TypeVar("T")
+
+
+def _cached_with_gradient(compute: Callable[[Any], T]) -> functools.cached_property[T]:
+    """Cache a property with its gradient, even if it is first read under `torch.no_grad`."""
+
+    @functools.wraps(compute)
+    def computed(self: "SoftCorrespondence") -> T:
+        with torch.enable_grad():
+            return compute(self)
+
+    return functools.cached_property(computed)
 
 
 class SoftCorrespondence:
@@ -57,7 +72,7 @@ class SoftCorrespondence:
         """M."""
         return self.feature_target.shape[1]
 
-    @functools.cached_property
+    @_cached_with_gradient
     def _vectors(self) -> tuple[Tensor, Tensor, Tensor | None]:
         """Vectors (B, N, D) and (B, M, D) whose dot products are logits, and outlier logits."""
         return self.scale * self.feature_source, self.feature_target, self.outlier
@@ -71,19 +86,19 @@ class SoftCorrespondence:
         if cached is None or (y is not None and cached[0] is not y):
             a, b, _ = self._vectors
             values = b[..., :0] if y is None else y.to(b.dtype)
-            with torch.autocast(a.device.type, enabled=False):
+            with torch.enable_grad(), torch.autocast(a.device.type, enabled=False):
                 cached = y, *softmax_rows(a, b, values.detach())
             self._cached_rows = cached
         return cached[1:]
 
-    @functools.cached_property
+    @_cached_with_gradient
     def _logits(self) -> Tensor:
         a, b, last = self._vectors
         with torch.autocast(a.device.type, enabled=False):
             scores = a @ b.mT
         return scores if last is None else torch.cat([scores, last.unsqueeze(-1)], -1)
 
-    @functools.cached_property
+    @_cached_with_gradient
     def _prob(self) -> Tensor:
         return self._logits.softmax(-1)
 
@@ -162,7 +177,7 @@ class SoftCorrespondence:
 class _LogCorrespondence(SoftCorrespondence):
     """A matrix whose logits are already its logarithm; rows sum to at most one."""
 
-    @functools.cached_property
+    @_cached_with_gradient
     def _prob(self) -> Tensor:
         return self._logits.exp()
 
@@ -205,7 +220,7 @@ class SinkhornCorrespondence(_LogCorrespondence):
         self.iterations = iterations
         self.slack: Slack = slack
 
-    @functools.cached_property
+    @_cached_with_gradient
     def _vectors(self) -> tuple[Tensor, Tensor, Tensor | None]:
         """Write the normalised log matrix as dot products of longer vectors."""
         f_x, f_y = self.feature_source, self.feature_target
@@ -244,7 +259,7 @@ class MatchabilityCorrespondence(_LogCorrespondence):
         super().__init__(feature_source, feature_target, scale, -matchable_source)
         self.matchable_target = _at_least_float32(matchable_target)
 
-    @functools.cached_property
+    @_cached_with_gradient
     def _vectors(self) -> tuple[Tensor, Tensor, Tensor | None]:
         """Add the softmax over columns and the matchabilities, as dot products too."""
         a, b, out = super()._vectors

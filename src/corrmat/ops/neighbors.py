@@ -13,10 +13,11 @@ _CHUNK = 2**24  # entries of a distance matrix that exist at once
 def knn(points: Tensor, k: int) -> Tensor:
     """Find the k nearest points of the same cloud, the point itself included.
 
-    Only a slice of the distance matrix exists at a time.
+    Only a slice of the distance matrix exists at a time. Large clouds get it from matrix products,
+    which round by the distance from the origin: a cloud a hundred radii away has wrong neighbours.
 
     Args:
-        points: (B, N, 3).
+        points: (B, N, 3), near the origin.
         k: how many, at most N.
 
     Returns:

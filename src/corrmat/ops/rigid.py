@@ -115,7 +115,7 @@ class _RotationFromCovariance(torch.autograd.Function):
     """SVD forward; backward by perturbing the optimality condition instead of the SVD.
 
     At the optimum G = R H is symmetric. With R -> exp([w]) R and H -> H + dH, staying
-    symmetric demands (tr(G) I - G) w = axial(R dH), a 3 x 3 system that is singular only
+    symmetric demands (tr(G) I - G) w = -axial(R dH), a 3 x 3 system that is singular only
     where the rotation itself is not determined. There we drop the undetermined directions.
     """
 

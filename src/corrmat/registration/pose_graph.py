@@ -30,7 +30,7 @@ class ScanPose:
 
     transform: np.ndarray  # (4, 4) float64, T_target_scan, in the scans' own units
     confidence: float  # of the weakest registration on the surest way; low if most disagree
-    calibrated: bool  # whether it was fitted to the model
+    calibrated: bool  # as of a `Registration`
     agree: int  # registrations of this scan that agree with the poses
     verdict: str  # as of a `Registration`
 

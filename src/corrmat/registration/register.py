@@ -113,7 +113,7 @@ def register(
         coherence=of_large[0],
         correlation=of_large[1],
         confidence=confidence,
-        calibrated=hypotheses.verification is not None,
+        calibrated=hypotheses.verification is not None and refine == "icp",
         rmse=rmse / scale,
         overlap=overlap,
         verdict=verdict(confidence, _reason(agrees, overlap, x.median / y.median, fewest)),

@@ -19,7 +19,7 @@ class Registration:
     coherence: float | None  # of two clouds of more than 2,048 points; None for others
     correlation: float | None  # their phase correlation; None for others
     confidence: float  # in [0, 1]: chance that the clouds are aligned
-    calibrated: bool  # whether it was fitted to this model, i.e. to the shipped weights
+    calibrated: bool  # whether it was fitted to this model and refinement: shipped weights and ICP
     rmse: float  # of aligned source points near a target point, in the clouds' units
     overlap: float  # share of source points near a target point: twice the spacing of points
     verdict: str  # "aligned", or "probably aligned: " or "doubtful: " and why
@@ -64,8 +64,8 @@ def to_text(registration: Registration) -> str:
 
 
 def note_on_confidence(calibrated: bool) -> str:
-    """Say which confidence was not fitted to its model."""
-    return "" if calibrated else "  (fitted to the shipped weights, not to this model)"
+    """Say which confidence was not fitted to its model and refinement."""
+    return "" if calibrated else "  (fitted to the shipped weights with ICP, not to these options)"
 
 
 def matrix_lines(transform: np.ndarray) -> list[str]:

@@ -15,10 +15,11 @@ from corrmat.training.hardware import count_devices, trainer_options
 from corrmat.training.recipe import ArmSettings
 from corrmat.types import Prediction, fewest_points
 
-# Options of the Trainer that cut the frozen test pairs, or that checkpoints cannot go on from.
+# Options of the Trainer that cut the frozen test pairs, that checkpoints cannot go on from, or that
+# replace layers which networks/ computes in a way of its own.
 _UNSUPPORTED = (
     "fast_dev_run", "overfit_batches", "limit_test_batches", "reload_dataloaders_every_n_epochs",
-    "min_steps", "min_epochs", "barebones",
+    "min_steps", "min_epochs", "barebones", "sync_batchnorm",
 )  # fmt: skip
 
 

@@ -125,6 +125,9 @@ def load(
     """
     merged = _merge_layers(path, scale)
     _check_keys(merged, path)
+    scales = cast(Settings, merged.get("scales") or {})
+    if scales and scale not in (*scales, "laptop"):  # whose settings may be those without a scale
+        raise CorrmatError(f"{path} has no scale {scale}, but {', '.join(scales)}")
     all_arms = cast(dict[str, Settings | None], merged["arms"])
     for arm in arms or ():
         if arm not in all_arms:

@@ -4,6 +4,7 @@ All are made on first use and cached. Shape i of a split is a pure function of (
 Families take turns, so that the first n shapes are a balanced data set of their own.
 """
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 
@@ -77,7 +78,7 @@ def _load(
     folder = cache_folder() / f"{name}-v{VERSION}-{split}"
     clouds = open_shards(folder)
     if clouds is None and count <= SMALL:
-        rows, labels = zip(*map(make, [(split, index) for index in range(count)]), strict=True)
+        rows, labels = zip(*(_make_once(make, split, i) for i in range(count)), strict=True)
         return CloudSet(np.stack(rows), np.array(labels, np.int64), names)
     if clouds is None:
         tasks = [(split, index) for index in range(size)]
@@ -85,6 +86,12 @@ def _load(
         clouds = open_shards(folder)
     assert clouds is not None
     return clouds.select(slice(count))
+
+
+@functools.lru_cache(2 * SMALL)
+def _make_once(make: MakeShape, split: str, index: int) -> tuple[np.ndarray, int]:
+    """Make a shape, or return it: all arms of a run ask for the same few."""
+    return make((split, index))
 
 
 def make_shape(task: tuple[str, int]) -> tuple[np.ndarray, int]:
