@@ -226,8 +226,10 @@ def test_a_checkpoint_of_another_network_is_refused(tmp_path, capsys):
 def test_a_missing_checkpoint_is_named_before_any_shape_is_made(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("CORRMAT_CACHE", str(tmp_path / "cache"))
     words = ["--config", str(ROOT / "configs/exp/1.2.yaml"), "--runs", str(tmp_path / "runs")]
-    assert main(["evaluate", *words]) == 2
-    assert "train first" in capsys.readouterr().err
+    for checkpoint, message in (([], "train first"), (["none.ckpt"], "train first"), (["2.9/DCP"],
+                                "no model '2.9/DCP'")):  # fmt: skip
+        assert main(["evaluate", *words, *(f"--checkpoint={each}" for each in checkpoint)]) == 2
+        assert message in capsys.readouterr().err
     assert not (tmp_path / "cache").exists()
 
 
@@ -301,3 +303,21 @@ def test_help_of_a_script_says_what_the_script_does():
     words = [sys.executable, ROOT / "reproduce" / "checkpoints.py", "--help"]
     shown = subprocess.run(words, capture_output=True, text=True).stdout
     assert shown.startswith("The trained arms of recorded experiments")
+
+
+def test_evaluate_takes_shipped_weights(capsys):
+    few = ["--data.train_shapes", "20", "--data.test_shapes", "8"]
+    words = ["evaluate", "--config", str(ROOT / "configs/exp/1.2.yaml"), *few, "--checkpoint"]
+    assert main([*words, "1.2/DCP_corr"]) == 0
+    shown = capsys.readouterr().out
+    assert "checkpoint: 1.2/DCP_corr" in shown
+    accuracy = next(line for line in shown.splitlines() if line.startswith("match_accuracy"))
+    assert float(accuracy.split()[1]) > 0.8  # untrained: about 0.01
+    assert main([*words, "2.2/RPMNet_corr"]) == 2
+    assert "fit" in capsys.readouterr().err
+
+
+def test_a_page_is_not_written_to_standard_output(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["register", "a.ply", "b.ply", "--html", "-"]) == 2
+    assert "the page is HTML, - is standard output" in capsys.readouterr().err

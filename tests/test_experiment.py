@@ -442,6 +442,15 @@ def test_nothing_is_deleted_or_trained_when_the_test_split_cannot_be_read(tmp_pa
     assert best.stat().st_mtime_ns == before
 
 
+def test_two_processes_do_not_train_into_one_folder(tmp_path):
+    loaded, folder = load("1.1", arms=["DCP"]), tmp_path / "runs/smoke/shapes/1.1/DCP"
+    with runs.only_process(folder), pytest.raises(CorrmatError, match="another process trains"):
+        experiment.run(loaded, tmp_path / "results", tmp_path / "runs")
+    assert not folder.exists()
+    experiment.run(loaded, tmp_path / "results", tmp_path / "runs")
+    assert (folder / "best.ckpt").is_file()
+
+
 def test_the_run_of_a_record_is_kept_while_others_come_and_go(tmp_path):
     loaded, folder = load("1.1", arms=["DCP"]), tmp_path / "runs/smoke/shapes/1.1/DCP"
     experiment.run(loaded, tmp_path / "results", tmp_path / "runs")

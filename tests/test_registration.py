@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 import corrmat
 from corrmat import weights
 from corrmat.baselines import fpfh_ransac
-from corrmat.calibration import SURE, verdict
+from corrmat.calibration import SURE, as_percent, verdict
 from corrmat.cli import main
 from corrmat.data.normals import estimate_normals
 from corrmat.data.scan_pairs import make_object_pair, make_room_pair
@@ -366,7 +366,7 @@ def test_the_command_writes_what_it_promises(pair, tmp_path, capsys):
         (["a.ply", "a.ply", "--model", "none.pth"], "no model 'none.pth'"),
         (["a.ply", "a.ply", "--model", "a.ply"], "a.ply is no checkpoint"),
         (["a.ply", "a.ply", "--model", "a.stl"], "a.stl is no checkpoint"),
-        (["a.ply", "two.xyz"], "target: 2 points"),
+        (["a.ply", "two.xyz"], "two.xyz: 2 points"),
         (["a.ply", "a.ply", "--json", "x", "--html", "./x"], "x is named for two results"),
     ],
 )
@@ -577,7 +577,7 @@ def test_a_masked_array_is_refused(pair):
 
 def test_the_last_title_of_an_animation_fits_into_it(pair):
     result = corrmat.register(*np.random.default_rng(0).normal(size=(2, 200, 3)))
-    assert _title(result, 1.0, 0) == f"doubtful, confidence {result.confidence:.0%}"
+    assert _title(result, 1.0, 0) == f"doubtful, confidence {as_percent(result.confidence)}"
 
 
 @pytest.mark.parametrize(
@@ -664,6 +664,11 @@ def test_only_the_shipped_weights_have_a_calibrated_confidence(pair):
     ways = {"model": "corrmat"}, {"model": "icp"}, {"refine": "none"}
     texts = [result.to_text(corrmat.register(source, target, **way)) for way in ways]
     assert ["fitted to the shipped weights" in text for text in texts] == [False, True, True]
+
+
+def test_a_printed_confidence_does_not_reach_a_verdict_that_it_has_not():
+    for confidence, shown in ((0.9396, "93%"), (SURE, "94%"), (0.4961, "49%"), (1.0, "100%")):
+        assert as_percent(confidence) == shown
 
 
 def test_the_verification_network_registers_nothing_alone(pair):

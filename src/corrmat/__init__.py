@@ -62,6 +62,11 @@ _MODULES = {
 }
 
 
+def __dir__() -> list[str]:
+    """List the public names, also those not yet imported."""
+    return sorted(__all__)
+
+
 def __getattr__(name: str) -> object:
     """Import a public name on first use."""
     if name in _MODULES:

@@ -20,6 +20,11 @@ def verdict(confidence: float, reason: str) -> str:
     return f"{'probably aligned' if confidence >= LIKELY else 'doubtful'}: {reason}"
 
 
+def as_percent(confidence: float) -> str:
+    """Format a confidence, rounded down: it never reaches a verdict that it has not."""
+    return f"{int(100 * confidence)}%"
+
+
 @dataclass(frozen=True)
 class Calibration:
     """Logistic curves from the scores of a registration to the chance that it is right.

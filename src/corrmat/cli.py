@@ -16,6 +16,7 @@ from corrmat.options import EXPERIMENT_COMMANDS, SHORT_HELP, build_parser, parse
 if TYPE_CHECKING:
     import numpy as np
 
+    from corrmat.registration.preparation import Cloud
     from corrmat.training.recipe import Recipe
 
 _STDOUT = Path("-")  # as a file to write
@@ -89,6 +90,7 @@ def _evaluate(options: Namespace) -> int:
     loaded = _load_arm(options)
     from corrmat.metrics import summary
     from corrmat.training import experiment, fit, preflight, runs
+    from corrmat.weights import load_model, load_state
 
     name = loaded.treatment
     folders = runs.arm_folders(loaded, name, options.runs)
@@ -97,9 +99,19 @@ def _evaluate(options: Namespace) -> int:
         scales = ", ".join(sorted(path.relative_to(options.runs).parts[0] for path in others))
         hint = f"there is one of --scale {scales}" if scales else "train first (corrmat fit)"
         raise CorrmatError(f"no checkpoint {folders[0] / 'best.ckpt'}; {hint}")
+    given = options.checkpoint
+    network = None
+    if given is not None and given.suffix != ".ckpt":
+        network = load_model(given)
+    elif given is not None and not given.is_file():
+        raise CorrmatError(f"no checkpoint {given}; train first (corrmat fit)")
     arm = preflight.prepare(loaded.arms[name])
-    checkpoint = options.checkpoint or runs.best_checkpoint(loaded, arm, options.runs)
-    method = fit.load_trained(arm, checkpoint)
+    checkpoint = given or runs.best_checkpoint(loaded, arm, options.runs)
+    if network is None:
+        method = fit.load_trained(arm, checkpoint)
+    else:
+        method = preflight.build_method(arm.settings)
+        load_state(method.network, network.state_dict())
     print(f"checkpoint: {checkpoint}")
     tests = fit.score(method, arm, experiment.bands(loaded.bands_deg))
     for band, per_pair in enumerate(tests):
@@ -149,6 +161,8 @@ def _compare(options: Namespace) -> int:
         _refuse_folder(options.record)
         ensure_writable(options.record.parent)
     about = {name: options[name] for name in ("protocol", "data", "points")}
+    if options.points is None:
+        about["points"] = benchmark.TABLE_POINTS.get(options.protocol, (512,))[0]
     if options.protocol in benchmark.SCANS:
         if options.data != "shapes" or options.root:
             raise CorrmatError(
@@ -179,8 +193,9 @@ def _register(options: Namespace) -> int:
         (options.gif, "the animation is a GIF", (".gif", "")),
         (options.html, "the page is HTML", (".html", ".htm", "")),
     ):
-        if path is not None and path.suffix.lower() not in suffixes:
-            raise CorrmatError(f"{what}, {path} has another suffix")
+        if path is not None and (path == _STDOUT or path.suffix.lower() not in suffixes):
+            has = "- is standard output" if path == _STDOUT else f"{path} has another suffix"
+            raise CorrmatError(f"{what}, {has}")
     for path in files:
         if written.count(path.resolve()) > 1:
             raise CorrmatError(f"{path} is named for two results, and one would be lost")
@@ -235,13 +250,11 @@ def _register_pair(options: Namespace) -> str:
     from corrmat.files import replace_bytes, replace_text
 
     names = str(options.source[0]), str(options.target)
-    source, target = _read_scans(options)
+    (source, target), clouds = _read_scans(options)
     from corrmat.registration.register import register
     from corrmat.registration.result import to_json, to_text
 
-    registration = register(
-        source, target, model=options.model, refine=options.refine, seed=options.seed
-    )
+    registration = register(*clouds, model=options.model, refine=options.refine, seed=options.seed)
     print(to_text(registration))
     if options.output is not None:
         write_moved(options.output, options.source[0], registration.transform)
@@ -261,16 +274,15 @@ def _register_pair(options: Namespace) -> str:
     return content
 
 
-def _read_scans(options: Namespace) -> "list[np.ndarray]":
-    """Read all scans; an error in their points, too, names the file."""
+def _read_scans(options: Namespace) -> "tuple[list[np.ndarray], list[Cloud]]":
+    """Read the points of all scans and prepare their clouds; errors name the file."""
     from corrmat.data.scans import read_scan
     from corrmat.registration.preparation import Cloud
 
     paths = *options.source, options.target
     scans = [read_scan(path, options.seed) for path in paths]
-    for path, scan in zip(paths, scans, strict=True):
-        Cloud.of(scan, str(path), options.seed)
-    return scans
+    named = zip(scans, map(str, paths), strict=True)
+    return scans, [Cloud.of(scan, name, options.seed) for scan, name in named]
 
 
 def _write_json(path: Path | None, content: str) -> None:
@@ -288,11 +300,11 @@ def _register_several(options: Namespace) -> str:
         raise CorrmatError("--html and --gif show two scans; --output moves several, to look at")
     from corrmat.data.scans import write_moved
 
-    scans = _read_scans(options)
+    _, clouds = _read_scans(options)
     from corrmat.registration import pose_graph
 
     poses = pose_graph.register_scans(
-        scans, model=options.model, refine=options.refine, seed=options.seed
+        clouds, model=options.model, refine=options.refine, seed=options.seed
     )
     print(pose_graph.to_text(options.source, options.target, poses))
     if options.output is not None:
@@ -367,9 +379,10 @@ def _robustness(options: Namespace) -> int:
     from corrmat.files import ensure_writable
     from corrmat.reporting import robustness
 
-    folder = options.results / options.scale / "robustness"
+    smoke = options.scale == "smoke"
+    folder = options.results / ("smoke" if smoke else "laptop") / "robustness"
     ensure_writable(folder)
-    draws = 20 if options.scale == "smoke" else 400
+    draws = 20 if smoke else 400
     result = robustness.run(folder, draws=draws, seed=options.seed)
     print("mean rotation error, deg, by per cent corrupted:\n")
     print(robustness.terminal_table(result))

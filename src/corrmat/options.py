@@ -61,6 +61,7 @@ Ctrl-C saves a checkpoint; the same command continues from it."""
 
 EVALUATE_EPILOG = """examples:
   corrmat evaluate --config configs/exp/1.1.yaml
+  corrmat evaluate --config configs/exp/1.2.yaml --checkpoint 1.2/DCP_corr
   corrmat evaluate --config configs/exp/1.1.yaml --checkpoint best.ckpt --data.rotation_deg 45"""
 
 COMPARE_EPILOG = """examples:
@@ -72,8 +73,8 @@ protocols:
           each cloud without 30 % of its points
   views   what two depth cameras see of one shape, up to 60 degrees apart
   clean   real without crop and outliers
-  dense   dense scans of one procedural object: cropped, or seen by a camera (--points 20000)
-  rooms   fragments of procedural rooms, in metres (--points 20000)
+  dense   two scans of a procedural object, 20,000 points: cropped, or seen by a camera
+  rooms   two fragments of a procedural room, 20,000 points, in metres
   paper   the pairs of experiment 1.2
 
 classical pipelines: icp; ransac and fgr, over FPFH features; ransac17, RANSAC with seventeen
@@ -226,7 +227,8 @@ def build_parser(with_settings: Sequence[str] = ()) -> ArgumentParser:
     robustness = add("robustness", "figure 2: wrong matches against a wrong rotation vector")
     robustness.add_argument(
         "--scale", type=Scale, default="laptop",
-        help=f"smoke: 20 draws a point of a curve instead of 400 {DEFAULT}",
+        help="smoke: 20 draws a point of a curve; any other: 400, in results/laptop, since nothing "
+        f"is trained {DEFAULT}",
     )  # fmt: skip
     robustness.add_argument("--results", type=Path, default=Path("results"), help=RESULTS_HELP)
     robustness.add_argument("--seed", type=_count, default=0, help=SEED_HELP)
@@ -286,8 +288,10 @@ def _add_experiment_options(
         parser.add_argument("--arm", help="one of the recipe's arms (default: its METHOD_corr)")
     if name == "evaluate":
         parser.add_argument(
-            "--checkpoint", type=Path, help="default: best.ckpt of the arm's last fit or run"
-        )
+            "--checkpoint", type=Path,
+            help="weights to test, as --model of corrmat register takes them (default: best.ckpt "
+            "of the arm's last fit or run)",
+        )  # fmt: skip
     if name in with_settings:
         from corrmat.training.recipe import add_settings
 
@@ -304,8 +308,8 @@ def _add_compare_options(parser: ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument("--root", type=Path, help="folder of the data set")
     parser.add_argument(
-        "--points", type=_positive, default=512,
-        help=f"points of a cloud before it is cropped {DEFAULT}",
+        "--points", type=_positive,
+        help="points of a cloud before it is cropped (default: 20,000 of scans, else 512)",
     )  # fmt: skip
     parser.add_argument("--pairs", type=_positive, default=120, help=f"number of pairs {DEFAULT}")
     parser.add_argument(

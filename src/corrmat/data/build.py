@@ -7,9 +7,9 @@ from typing import TypeVar, cast
 import joblib
 import numpy as np
 from joblib.externals.loky import get_reusable_executor
-from rich.progress import track
 
 from corrmat.data.clouds import finish_shards, missing_shards, write_shard
+from corrmat.progress import track
 
 SHARD = 250  # shapes of a shard
 
@@ -44,7 +44,9 @@ def build_shards(
         joblib.delayed(make)(task) for task in pending
     )
     assert isinstance(shapes, Iterator)
-    progress = cast(Iterator[Shape | str], iter(track(shapes, title, total=len(pending))))
+    progress = cast(
+        Iterator[Shape | str], iter(track(shapes, title, len(pending), transient=False))
+    )
     for number in missing:
         results = [next(progress) for _ in chunks[number]]
         good = [result for result in results if not isinstance(result, str)]

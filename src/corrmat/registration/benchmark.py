@@ -8,7 +8,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
-from rich.progress import track
 from scipy.spatial import KDTree
 
 from corrmat.data.pairs import STREAM, Key, PairSettings, Split, make_pairs
@@ -16,6 +15,7 @@ from corrmat.data.registry import load_clouds
 from corrmat.data.scan_pairs import ScanPair, make_object_pair, make_room_pair
 from corrmat.errors import CorrmatError
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG, rotation_error_deg
+from corrmat.progress import track
 from corrmat.registration.register import register
 from corrmat.reporting.model_results import SCORES, ModelResult
 from corrmat.types import PairBatch
@@ -158,10 +158,7 @@ def compare(pairs: PairBatch, models: Sequence[str]) -> dict[str, ModelResult]:
     return {
         model: summarise(
             pairs,
-            [
-                _register_pair(pairs, index, model)
-                for index in track(range(len(pairs)), model, transient=True)
-            ],
+            [_register_pair(pairs, index, model) for index in track(range(len(pairs)), model)],
         )
         for model in models
     }

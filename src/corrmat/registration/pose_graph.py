@@ -7,13 +7,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-from rich.progress import track
 from scipy.spatial.transform import Rotation
 from torch import nn
 
-from corrmat.calibration import verdict
+from corrmat.calibration import as_percent, verdict
 from corrmat.errors import CorrmatError
 from corrmat.ops import rigid
+from corrmat.progress import track
 from corrmat.registration.preparation import Cloud
 from corrmat.registration.register import DOUBTFUL, Refine, register
 from corrmat.registration.result import matrix_lines, note_on_confidence
@@ -36,7 +36,7 @@ class ScanPose:
 
 
 def register_scans(
-    scans: Sequence[np.ndarray],
+    scans: Sequence[np.ndarray | Cloud],
     *,
     model: str | Path | nn.Module = "corrmat",
     refine: Refine = "icp",
@@ -49,7 +49,7 @@ def register_scans(
     rest (chordal rotation averaging, Hartley et al., IJCV 2013).
 
     Args:
-        scans: two or more clouds, each (N, 3) or (N, 6); the last is the target.
+        scans: two or more, each as for `register`; the last is the target.
         model: as for `register`.
         refine: as for `register`.
         seed: as for `register`.
@@ -68,8 +68,8 @@ def register_scans(
     ]
     edges = []
     pairs = list(itertools.combinations(range(len(scans)), 2))
-    for i, j in track(pairs, "registering pairs", transient=True, disable=len(pairs) == 1):
-        result = register(scans[i], scans[j], model=model, refine=refine, seed=seed)
+    for i, j in track(pairs, "registering pairs"):
+        result = register(clouds[i], clouds[j], model=model, refine=refine, seed=seed)
         edges.append(_Edge(i, j, result.transform, result.confidence, result.calibrated))
     graph = _PoseGraph(clouds, edges)
     return [graph.pose(index) for index in range(len(scans) - 1)]
@@ -80,7 +80,7 @@ def to_text(paths: Sequence[Path], target: Path, poses: Sequence[ScanPose]) -> s
     lines = [f"every scan onto {target} (target = matrix @ scan):"]
     for path, pose in zip(paths, poses, strict=True):
         lines.append(
-            f"{path}: {pose.verdict}, confidence {pose.confidence:.0%}"
+            f"{path}: {pose.verdict}, confidence {as_percent(pose.confidence)}"
             f"{note_on_confidence(pose.calibrated)}"
         )
         lines += matrix_lines(pose.transform)

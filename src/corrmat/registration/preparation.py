@@ -26,7 +26,9 @@ class PreparedClouds(NamedTuple):
     scorers: list[AlignmentScorer]  # of more and more points
 
 
-def prepare_clouds(source: np.ndarray, target: np.ndarray, seed: int) -> PreparedClouds:
+def prepare_clouds(
+    source: "np.ndarray | Cloud", target: "np.ndarray | Cloud", seed: int
+) -> PreparedClouds:
     """Check, centre, scale and subsample two clouds; see `register`."""
     x, y = Cloud.of(source, "source", seed), Cloud.of(target, "target", seed)
     scale = 2 * MEDIAN / (x.median + y.median)
@@ -49,12 +51,14 @@ class Cloud:
         self.median = float(np.median(np.linalg.norm(self.centred, axis=1)))
 
     @classmethod
-    def of(cls, cloud: np.ndarray, name: str, seed: int) -> "Cloud":
-        """Check a cloud and bring it into canonical order.
+    def of(cls, cloud: "np.ndarray | Cloud", name: str, seed: int) -> "Cloud":
+        """Check a cloud and bring it into canonical order, if that has not been done yet.
 
         Raises:
-            CorrmatError: see `register`.
+            CorrmatError: see `register`; the message begins with the name.
         """
+        if isinstance(cloud, Cloud):
+            return cloud
         if isinstance(cloud, str | Path):
             raise CorrmatError(f"{name}: points are needed; corrmat.read_scan reads a file")
         if isinstance(cloud, np.ma.MaskedArray):

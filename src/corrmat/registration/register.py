@@ -20,7 +20,7 @@ from corrmat.registration.choice import (
     weights_for,
 )
 from corrmat.registration.hypotheses import CLASSICAL, HypothesisGenerator, NetworkHypotheses
-from corrmat.registration.preparation import prepare_clouds, to_original_units
+from corrmat.registration.preparation import Cloud, prepare_clouds, to_original_units
 from corrmat.registration.result import Registration
 from corrmat.registration.verification import verify
 from corrmat.weights import load_model
@@ -32,8 +32,8 @@ OTHER_SIZE = 8.0  # times as large: two such clouds may have different units
 
 
 def register(
-    source: np.ndarray,
-    target: np.ndarray,
+    source: np.ndarray | Cloud,
+    target: np.ndarray | Cloud,
     *,
     model: str | Path | nn.Module = "corrmat",
     refine: Refine = "icp",
@@ -46,8 +46,8 @@ def register(
     order, with the same seed, give the same matrix.
 
     Args:
-        source: (N, 3), or (N, 6) with unit normals.
-        target: (M, 3), or (M, 6).
+        source: (N, 3), or (N, 6) with unit normals; or a `Cloud` of such points and this seed.
+        target: (M, 3), or (M, 6); or a `Cloud`.
         model: "corrmat" for the shipped weights; "icp", or where they are installed "ransac",
             "ransac17", "fgr" or "kiss", for the classical pipelines; whatever else `load_model`
             takes; or a network, or a method, of your own.

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from corrmat.calibration import as_percent
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Registration:
@@ -56,7 +58,8 @@ def to_text(registration: Registration) -> str:
         agree, matches = registration.match_agrees.sum(), len(registration.matches)
         lines.append(f"matches      {agree} of {matches} agree with the transform")
     lines += [
-        f"confidence   {registration.confidence:.0%}{note_on_confidence(registration.calibrated)}",
+        f"confidence   {as_percent(registration.confidence)}"
+        f"{note_on_confidence(registration.calibrated)}",
         f"verdict      {registration.verdict}",
     ]
     lines.append(f"({registration.model}, seed {registration.seed}, {registration.seconds:.2f} s)")

@@ -17,7 +17,6 @@ import lightning as L
 import numpy as np
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
-from rich.progress import track
 from torch import Tensor
 from torch.utils.data import DataLoader
 
@@ -25,6 +24,7 @@ from corrmat import weights
 from corrmat.data.datamodule import PairDataset, RegistrationDataModule
 from corrmat.networks.verification import VerificationNetwork
 from corrmat.ops import rigid
+from corrmat.progress import track
 from corrmat.registration import benchmark
 from corrmat.registration.choice import (
     CHOICE_WEIGHTS,
@@ -88,7 +88,7 @@ def train_verification(
     with ProcessPoolExecutor(workers or 1, spawn, torch.set_num_threads, (1,)) as pool:
         write = functools.partial(write_shard, data=data, seed=seed, count=count)
         written = (pool.map if workers else map)(write, missing.values(), missing)
-        for _ in track(written, "candidates", len(missing), transient=True):
+        for _ in track(written, "candidates", len(missing)):
             pass
     sets = [CandidateSet(*content) for path in shards.values() for content in torch.load(path)]
     useful = [each for each in sets if 0 < each.right.sum() < len(each.right)]

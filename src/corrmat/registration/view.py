@@ -5,6 +5,7 @@ import json
 import numpy as np
 import plotly.graph_objects as go
 
+from corrmat.calibration import as_percent
 from corrmat.registration.result import Registration, matrix_lines
 from corrmat.registration.scene import build_scene, extent
 from corrmat.reporting.figures import BLUE, GREEN, GREY, RED
@@ -62,6 +63,7 @@ def registration_page(
     return render(
         "registration.html.j2",
         registration=registration,
+        confidence=as_percent(registration.confidence),
         names=names,
         matrix="\n".join(matrix_lines(registration.transform)),
         path=json.dumps(path),

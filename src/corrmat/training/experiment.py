@@ -131,12 +131,13 @@ def train_or_reuse(
     fresh: bool = False,
 ) -> TrainedArm:
     """Train an arm of an experiment, unless it is trained already."""
-    trained = None if fresh else runs.find_trained(recipe, arm, runs_folder)
-    if trained is not None:
-        log.info(f"trained already: {trained.checkpoint.parent}")
-        return trained
     folder = runs_folder / recipe.place / arm.name
-    return train(arm, folder, recipe.place.as_posix(), logger, board, fresh=fresh)
+    with runs.only_process(folder):
+        trained = None if fresh else runs.find_trained(recipe, arm, runs_folder)
+        if trained is not None:
+            log.info(f"trained already: {trained.checkpoint.parent}")
+            return trained
+        return train(arm, folder, recipe.place.as_posix(), logger, board, fresh=fresh)
 
 
 def _time_to_train(arm: Arm) -> str:

@@ -1,5 +1,6 @@
 """What lies under runs/: which arm is trained with which settings, and where to continue."""
 
+import contextlib
 import itertools
 import json
 import logging
@@ -10,11 +11,14 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
+import filelock
 import torch
 import yaml
 
+from corrmat.errors import CorrmatError
 from corrmat.files import replace_text
 from corrmat.reporting.record import COMMIT_SEPARATOR
+from corrmat.training.hardware import is_first_process
 from corrmat.training.preflight import Arm
 from corrmat.training.recipe import Recipe, Settings, default_settings, merge
 from corrmat.weights import checksum, load_model
@@ -42,6 +46,26 @@ def arm_folders(recipe: Recipe, arm: str, runs: Path) -> list[Path]:
     """List the folders of an arm: of this experiment, and of the one named by `networks_of`."""
     identities = filter(None, (recipe.id, recipe.networks_of))
     return [runs / recipe.place_of(identity) / arm for identity in identities]
+
+
+@contextlib.contextmanager
+def only_process(folder: Path) -> Iterator[None]:
+    """Keep other processes from training into a folder meanwhile; those of one training share it.
+
+    Raises:
+        CorrmatError: another process is at it.
+    """
+    if not is_first_process():
+        yield
+        return
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        with filelock.FileLock(folder.with_name(f".{folder.name}.lock"), timeout=0):
+            yield
+    except filelock.Timeout as error:
+        raise CorrmatError(
+            f"another process trains into {folder}; wait for it, or name another folder: --runs"
+        ) from error
 
 
 def training_settings(arm: Arm) -> str:
