@@ -51,7 +51,7 @@ VOXELS = {  # metres, or radii of an object
 WEIGHTS = {
     "those of small clouds": CHOICE_WEIGHTS,
     "without verification": LARGE_CLOUDS._replace(verification=0.0),
-    "without phase correlation": LARGE_CLOUDS._replace(correlation=0.0),
+    "without correlation in the score": LARGE_CLOUDS._replace(correlation=0.0),
     "without coherence": LARGE_CLOUDS._replace(coherence=0.0),
     "in use": LARGE_CLOUDS,
 }
@@ -147,7 +147,7 @@ def choices_of(
         final = to_original_units(final, scale, x.centre, y.centre)
         return benchmark.errors(pairs, index, final)
 
-    alone = "the network's candidates alone"
+    alone = "the network's candidates, no half turns"
     picked = {
         f"those of small clouds, {alone}": chosen(own, own_measures, CHOICE_WEIGHTS),
         f"in use, {alone}": chosen(own, own_measures, LARGE_CLOUDS),

@@ -16,7 +16,6 @@ from corrmat.errors import CorrmatError
 from corrmat.registration import pose_graph
 from corrmat.registration.pose_graph import ScanPose, register_scans, to_text
 from corrmat.registration.preparation import Cloud
-from corrmat.registration.preparation import Cloud
 
 
 def transforms(count, seed=0, far=0.0):

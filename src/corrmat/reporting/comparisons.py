@@ -67,14 +67,15 @@ def comparison_table(results: Path) -> str:
     The intervals are Wilson's, at 95 %. The p value is the exact McNemar test's: that the model
     is within 5 degrees as often as ours, on the same pairs.
     """
-    heads = ["pairs", "data", "points", "model", "within 5 deg", "ADD-S", "p", "ms a pair"]
+    heads = ["pairs", "data", "points", "model", "within 5 deg", "ADD-S", "p", "median deg", "ms"]
     lines = markdown_head(heads)
     for record in _read_comparisons(results):
         ours = record.models[OURS].within_angle
         for model, result in record.models.items():
             start = [record.protocol, record.data, str(record.points), model]
             recalls = _recall_cells(result, None if model == OURS else ours)
-            lines.append(markdown_row([*start, *recalls, f"{result.ms:.0f}"]))
+            more = f"{result.median_deg:.2g}", f"{result.ms:.0f}"
+            lines.append(markdown_row([*start, *recalls, *more]))
     return "\n".join(lines)
 
 

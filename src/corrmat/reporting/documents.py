@@ -102,14 +102,14 @@ def headline_table(results: Results) -> str:
             "",
             f"By the paper's metric METHOD_corr is ahead in {ahead} of these {len(ratios)} "
             f"experiments, and in {near} by at least half of the paper's ratio.",
-            f"All verdicts of the [ledger](docs/claims.md): {counted}.",
+            f"All verdicts of [docs/claims.md](docs/claims.md): {counted}.",
         ]
     )
 
 
 def rates_table(results: Path) -> str:
     """Build the table of the learning-rate sweeps: validation error by rate, the choice in bold."""
-    heads = ["experiment", "arm", "pairs", "a third of it", "starting rate", "three times it"]
+    heads = ["experiment", "arm", "pairs", "rate / 3", "starting rate", "3 times the rate"]
     lines = markdown_head(heads)
     for path in sorted(results.glob("rates/*/*/*.json")):
         sweep = json.loads(path.read_text())
