@@ -20,7 +20,7 @@ import matplotlib as mpl
 import torch
 from matplotlib import pyplot as plt
 
-from corrmat.files import replace_text
+from corrmat.files import replace_json
 
 PLACE = bench.ROOT / "results" / "bench"
 # The first kind one of whose words is in the operator's name.
@@ -125,7 +125,7 @@ def main() -> None:
             continue
         measured[label][name] = bench.in_a_process(dissect, *step)
         print(name, measured[label][name], flush=True)
-    replace_text(path, json.dumps(measured, indent=1) + "\n")
+    replace_json(path, measured)
     draw(measured)
     print(f"written: {path.relative_to(bench.ROOT)}, anatomy.png")
 

@@ -11,18 +11,17 @@ overnight in batches as in training, and adds the medians to results/batch_norm.
 
 import json
 import sys
-from dataclasses import asdict
 from pathlib import Path
 
 from torch import nn
 
-from corrmat.files import replace_text
+from corrmat.files import update_json
 from corrmat.methods import Method
-from corrmat.reporting.intervals import match_accuracy, median_rotation, pair_errors
+from corrmat.reporting.intervals import estimates, pair_errors
 from corrmat.reporting.writer import pair_rows
 from corrmat.revision import commit
 from corrmat.training.fit import score
-from corrmat.training.preflight import Arm, build_method, prepare
+from corrmat.training.preflight import build_method, prepare
 from corrmat.training.recipe import load
 from corrmat.weights import load_model, load_state
 
@@ -35,15 +34,6 @@ def use_statistics_of_batches(method: Method) -> None:
     for module in method.modules():
         if isinstance(module, nn.BatchNorm1d):
             module.running_mean = module.running_var = None
-
-
-def medians(method: Method, arm: Arm) -> dict[str, object]:
-    """Test a network, and return its median error and its matches, with intervals."""
-    errors = pair_errors(pair_rows(arm.name, score(method, arm)))
-    return {
-        "median_deg": asdict(median_rotation(errors)),
-        "match_accuracy": asdict(match_accuracy(errors)),
-    }
 
 
 def main(identity: str, name: str, model: str) -> None:
@@ -60,12 +50,11 @@ def main(identity: str, name: str, model: str) -> None:
     arm = prepare(load(path, "overnight", {}, [arm_name]).arms[arm_name])
     method = build_method(arm.settings)
     load_state(method.network, load_model(model).state_dict())
-    running = medians(method, arm)
+    running = estimates(pair_errors(pair_rows(arm.name, score(method, arm))))
     use_statistics_of_batches(method)
-    result = {"commit": today, "running": running, "batch": medians(method, arm)}
-    content = json.loads(PATH.read_text()) if PATH.is_file() else {}
-    content[f"{identity} {name}"] = result
-    replace_text(PATH, json.dumps(content, indent=1) + "\n")
+    batch = estimates(pair_errors(pair_rows(arm.name, score(method, arm))))
+    result = {"commit": today, "running": running, "batch": batch}
+    update_json(PATH, f"{identity} {name}", result)
     print(json.dumps(result, indent=1))
 
 

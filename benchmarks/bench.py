@@ -43,7 +43,7 @@ from corrmat.data.datamodule import EpochSampler, PairDataset  # noqa: E402
 from corrmat.data.pairs import Key, PairSettings, make_pairs  # noqa: E402
 from corrmat.data.shapes import dataset  # noqa: E402
 from corrmat.errors import CorrmatError  # noqa: E402
-from corrmat.files import replace_text  # noqa: E402
+from corrmat.files import replace_json  # noqa: E402
 from corrmat.losses import chamfer_loss, correspondence_loss  # noqa: E402
 from corrmat.methods import METHODS  # noqa: E402
 from corrmat.networks.dcp import DCPNetwork  # noqa: E402
@@ -147,7 +147,7 @@ def main() -> None:
     RECORD.parent.mkdir(parents=True, exist_ok=True)
     about = machine()
     content = {**about, "rows": rows, "growth": growth, "exponents": exponents, "recipes": recipes}
-    replace_text(RECORD, json.dumps(content, indent=1) + "\n")
+    replace_json(RECORD, content)
     draw(growth, exponents, RECORD.with_name("growth.png"))
     print(f"written: {RECORD.relative_to(ROOT)}, growth.png")
 
@@ -161,7 +161,7 @@ def measure_registration() -> None:
         if row["what"] in REGISTRATION:
             row |= in_a_process(REGISTRATION[row["what"]])
             print(row, flush=True)
-    replace_text(RECORD, json.dumps(content, indent=1) + "\n")
+    replace_json(RECORD, content)
 
 
 def machine() -> dict[str, object]:

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from rich.progress import track
 
-from corrmat.files import replace_text
+from corrmat.files import replace_json
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG
 from corrmat.networks.invariant import InvariantNetwork
 from corrmat.ops import rigid
@@ -172,7 +172,7 @@ def main() -> None:
             "right_matches": dict(zip(map(str, ANCHORS), means, strict=True)),
         }
     print(json.dumps(content, indent=1))
-    replace_text(PATH, json.dumps(content, indent=1) + "\n")
+    replace_json(PATH, content)
 
 
 if __name__ == "__main__":

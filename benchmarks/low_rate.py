@@ -15,10 +15,9 @@ import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from corrmat.files import replace_text
+from corrmat.files import update_json
 from corrmat.reporting.intervals import (
-    match_accuracy,
-    median_rotation,
+    estimates,
     p_of_equal_errors,
     pair_errors,
     ratio_of_medians,
@@ -58,22 +57,15 @@ def main(scale: str, data: str, root: str | None = None) -> None:
     for name in ("RPMNet_high_rate", ARM):
         peak = recipe.arms[name].optimizer.lr
         rows[f"{recipe.arms[name].method}, one cycle to {peak:g}"] = record[name]
-    content = json.loads(PATH.read_text()) if PATH.is_file() else {}
-    content[f"{scale}, {data}"] = {
+    content = {
         "commit": trained.commit,
         "pairs_seen": trained.pairs_seen,
-        "rows": {
-            name: {
-                "median_deg": asdict(median_rotation(errors)),
-                "match_accuracy": asdict(match_accuracy(errors)),
-            }
-            for name, errors in rows.items()
-        },
+        "rows": {name: estimates(errors) for name, errors in rows.items()},
         "ratio_at_the_low_rate": asdict(ratio_of_medians(record["RPMNet"], tested)),
         "p": p_of_equal_errors(record["RPMNet"], tested),
     }
-    replace_text(PATH, json.dumps(content, indent=1) + "\n")
-    print(json.dumps(content[f"{scale}, {data}"], indent=1))
+    update_json(PATH, f"{scale}, {data}", content)
+    print(json.dumps(content, indent=1))
 
 
 if __name__ == "__main__":

@@ -9,14 +9,13 @@ slack row gets nothing, and the share goes to source points that do not match. T
 with its own alpha and with alpha held, and adds a table of medians to results/slack.json.
 """
 
-import json
 import sys
 from pathlib import Path
 
 import torch
 from rich.progress import track
 
-from corrmat.files import replace_text
+from corrmat.files import update_json
 from corrmat.metrics import rotation_error_deg
 from corrmat.networks.rpmnet import AnnealingNet, RPMNetwork
 from corrmat.revision import commit
@@ -93,9 +92,7 @@ def main(name: str, model: str, data: str, root: str | None = None) -> None:
         medians = [round(value, 4) for value in errors.median(0).values.tolist()]
         rows["its own" if alpha is None else str(alpha)] = dict(zip(keys, medians, strict=True))
         print(f"{name}, alpha {alpha}: {medians}", flush=True)
-    content = json.loads(PATH.read_text()) if PATH.is_file() else {}
-    content[name] = {"commit": today, "pairs": len(errors), "alpha": rows}
-    replace_text(PATH, json.dumps(content, indent=1) + "\n")
+    update_json(PATH, name, {"commit": today, "pairs": len(errors), "alpha": rows})
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import safetensors
 
-from corrmat.files import replace_text
+from corrmat.files import replace_json
 from corrmat.registration import benchmark, hypotheses
 from corrmat.registration.shipping import (
     CALIBRATION_PAIRS,
@@ -67,7 +67,7 @@ def main() -> None:
                 for protocol, pairs in tests.items()
             }
             print(f"{run['pairs']:,} pairs", run["validation"], flush=True)
-    replace_text(TRAINING, json.dumps(runs, indent=1) + "\n")
+    replace_json(TRAINING, runs)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from corrmat.baselines import FpfhSettings, KissSettings
-from corrmat.files import replace_text
+from corrmat.files import replace_json
 from corrmat.registration import benchmark, hypotheses
 
 RESULTS = Path(__file__).resolve().parents[1] / "results" / "register" / "tuning.json"
@@ -53,7 +53,7 @@ def main() -> None:
         }
         rows.append({"model": model, "settings": chosen._asdict(), "recall_5deg": recalls})
         print(rows[-1], flush=True)
-        replace_text(RESULTS, json.dumps(rows, indent=1) + "\n")
+        replace_json(RESULTS, rows)
     for model in ("ransac", "fgr", "kiss"):
         tries = [row for row in rows if row["model"] == model]
         print("best", max(tries, key=lambda row: sum(row["recall_5deg"].values())))

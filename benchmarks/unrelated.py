@@ -6,11 +6,10 @@ Sources of test pairs beside targets of others, of the embedded shapes and of la
 record is results/register/unrelated.json; the confidence is computed from its scores.
 """
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 
-from corrmat.files import replace_text
+from corrmat.files import replace_json
 from corrmat.registration import benchmark
 from corrmat.reporting.comparisons import UNRELATED
 from corrmat.revision import commit
@@ -28,9 +27,7 @@ def main() -> None:
             result = benchmark.compare(pairs, ["corrmat"])["corrmat"]
             print(protocol, points)
             entries.append({"protocol": protocol, "points": points, "result": asdict(result)})
-    replace_text(
-        RESULTS / UNRELATED, json.dumps({"commit": code, "pairs": entries}, indent=1) + "\n"
-    )
+    replace_json(RESULTS / UNRELATED, {"commit": code, "pairs": entries})
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """Atomic writes: a reader never sees half a file."""
 
+import json
 import os
 import tempfile
 from collections.abc import Iterable
@@ -11,6 +12,17 @@ from corrmat.errors import CorrmatError
 def replace_text(path: Path, text: str) -> None:
     """Write text to a temporary file beside `path`, then rename it into place."""
     replace_bytes(path, text.encode())
+
+
+def replace_json(path: Path, content: object) -> None:
+    """Write indented JSON to a temporary file beside `path`, then rename it into place."""
+    replace_text(path, json.dumps(content, indent=1) + "\n")
+
+
+def update_json(path: Path, key: str, value: object) -> None:
+    """Set one key of the JSON object in a file, which need not be there yet."""
+    content = json.loads(path.read_text()) if path.is_file() else {}
+    replace_json(path, content | {key: value})
 
 
 def replace_bytes(path: Path, content: bytes | memoryview) -> None:

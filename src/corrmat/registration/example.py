@@ -1,6 +1,5 @@
 """Write two scans of one shape, to try `corrmat register` on."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +8,7 @@ import torch
 from corrmat.data.scans import write_ply
 from corrmat.data.shapes.dataset import make_shape
 from corrmat.errors import CorrmatError
-from corrmat.files import refuse_existing, replace_text
+from corrmat.files import refuse_existing, replace_json
 from corrmat.ops import rigid
 
 SHAPE = 25  # of the test split: a piano
@@ -50,6 +49,4 @@ def write_example(folder: Path) -> None:
     transform = rigid.to_homogeneous(rotation, translation)
     write_ply(folder / "source.ply", scans[0])
     write_ply(folder / "target.ply", scans[1] @ rotation.T + translation)
-    replace_text(
-        folder / "truth.json", json.dumps({"transform": transform.tolist()}, indent=1) + "\n"
-    )
+    replace_json(folder / "truth.json", {"transform": transform.tolist()})

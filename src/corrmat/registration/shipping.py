@@ -15,7 +15,7 @@ from corrmat.calibration import SURE, Calibration, of_large_clouds
 from corrmat.data.datamodule import RegistrationDataModule
 from corrmat.data.pairs import STREAM, Key, make_pairs
 from corrmat.errors import CorrmatError
-from corrmat.files import ensure_writable, replace_text
+from corrmat.files import ensure_writable, replace_json
 from corrmat.registration import benchmark
 from corrmat.reporting.comparisons import TRAINING, TrainingRun, training_runs
 from corrmat.revision import commit
@@ -86,7 +86,7 @@ def add_training(results: Path, run: TrainingRun) -> None:
     """Add a training run to results/register/training.json."""
     path = results / TRAINING
     path.parent.mkdir(parents=True, exist_ok=True)
-    replace_text(path, json.dumps([*training_runs(results), run], indent=1) + "\n")
+    replace_json(path, [*training_runs(results), run])
 
 
 def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:

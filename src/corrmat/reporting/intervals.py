@@ -6,7 +6,7 @@ Everything here is computed from a record's per_pair.csv, so it needs no network
 import csv
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -93,6 +93,12 @@ def match_accuracy(errors: PairErrors) -> Estimate:
     """Estimate the share of matchable source points whose match is correct."""
     counts = [errors.num_correct, errors.num_matchable]
     return _bootstrap(counts, lambda correct, matchable: correct.sum(-1) / matchable.sum(-1))
+
+
+def estimates(errors: PairErrors) -> dict[str, dict[str, float]]:
+    """Estimate the median rotation error and the share of correct matches, for a JSON file."""
+    both = {"median_deg": median_rotation(errors), "match_accuracy": match_accuracy(errors)}
+    return {name: asdict(estimate) for name, estimate in both.items()}
 
 
 def ratio_of_medians(numerator: PairErrors, denominator: PairErrors) -> Estimate:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from corrmat.files import replace_text
+from corrmat.files import replace_json
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG
 
 SCORES = "agreement", "support", "coherence", "correlation"  # see `Calibration.confidence`
@@ -67,7 +67,7 @@ def write_comparison(
     models = {name: asdict(result) for name, result in results.items()}
     hardware = {"threads": torch.get_num_threads(), "cpu": torch.backends.cpu.get_cpu_capability()}
     content = {**about, "hardware": hardware, "models": models}
-    replace_text(path, json.dumps(content, indent=1) + "\n")
+    replace_json(path, content)
 
 
 def read_comparison(path: Path) -> Comparison:

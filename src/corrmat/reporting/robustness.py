@@ -5,7 +5,6 @@ rotation vector is Gaussian noise of standard deviation p % of pi on each compon
 tried it is nearest to the paper's chart (docs/robustness.md).
 """
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -16,7 +15,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from corrmat.data.pairs import Key, generator
-from corrmat.files import replace_text
+from corrmat.files import replace_json
 from corrmat.metrics import rotation_error_deg
 from corrmat.ops.rigid import axis_angle_to_matrix, procrustes
 from corrmat.reporting.figures import BLUE, RED, save
@@ -136,7 +135,7 @@ def run(folder: Path, draws: int = 400, seed: int = 0) -> Robustness:
     )
     folder.mkdir(parents=True, exist_ok=True)
     draw_figure(result, folder / "curve.png")
-    replace_text(folder / "curve.json", json.dumps(asdict(result), indent=1) + "\n")
+    replace_json(folder / "curve.json", asdict(result))
     return result
 
 

@@ -1,13 +1,12 @@
 """A learning-rate sweep: every arm's rate is chosen by the same short trainings on validation."""
 
-import json
 import logging
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from corrmat.errors import CorrmatError, DivergedError
-from corrmat.files import ensure_writable, replace_text
+from corrmat.files import ensure_writable, replace_json
 from corrmat.reporting.record import defined
 from corrmat.revision import commit
 from corrmat.training import loggers
@@ -98,7 +97,7 @@ def sweep(
         },
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    replace_text(path, json.dumps(content, indent=1) + "\n")
+    replace_json(path, content)
     for name, rates in swept.items():
         if chosen(rates) is None:
             tried = ", ".join(f"{rate.lr:g}" for rate in rates)

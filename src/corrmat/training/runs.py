@@ -16,7 +16,7 @@ import torch
 import yaml
 
 from corrmat.errors import CorrmatError
-from corrmat.files import replace_text
+from corrmat.files import replace_json, replace_text
 from corrmat.reporting.record import COMMIT_SEPARATOR
 from corrmat.training.hardware import is_first_process
 from corrmat.training.preflight import Arm
@@ -142,7 +142,7 @@ def _commits(folder: Path) -> list[str]:
 def finish_run(folder: Path, trained: TrainedArm) -> None:
     """Note that an arm is trained."""
     content = asdict(trained) | {"checkpoint": trained.checkpoint.name}
-    replace_text(folder / _TRAINED, json.dumps(content, indent=1))
+    replace_json(folder / _TRAINED, content)
 
 
 def trained_facts(folder: Path) -> dict[str, Any]:
