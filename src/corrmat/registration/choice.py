@@ -19,7 +19,10 @@ from corrmat.registration.scoring import (
 
 
 class ChoiceWeights(NamedTuple):
-    """A candidate scores its agreement + these times what the fields name."""
+    """A candidate scores its agreement + these times what the fields name.
+
+    All but the last are in the order of `measure`'s columns, whose first is the agreement.
+    """
 
     coherence: float
     unmatched_loss: float
