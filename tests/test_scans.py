@@ -112,6 +112,15 @@ def test_a_header_and_rows_of_other_lengths_are_refused(tmp_path):
     assert read_scan(tmp_path / "table.csv").tolist() == [[1, 2, 3], [4, 5, 6]]
 
 
+def test_fewer_points_than_the_first_line_says_are_a_file_cut_short(tmp_path):
+    rows = [" ".join(map(str, row)) for row in POINTS]
+    (tmp_path / "scan.pts").write_text("\n".join([str(len(rows)), *rows]))
+    assert len(read_scan(tmp_path / "scan.pts")) == len(POINTS)
+    (tmp_path / "scan.pts").write_text("\n".join([str(len(rows)), *rows[:-3]]))
+    with pytest.raises(CorrmatError, match=f"cut short: {len(rows) - 3} of {len(rows)} points"):
+        read_scan(tmp_path / "scan.pts")
+
+
 def test_an_array_that_lies_on_its_side_is_not_three_points(tmp_path):
     np.save(tmp_path / "side.npy", POINTS.T)
     with pytest.raises(CorrmatError, match="transpose it"):

@@ -297,8 +297,7 @@ def _text(path: Path) -> np.ndarray:
     last = re.split(r"[;\s]+", lines[-1])
     if len(last) > 1 and all(map(_DECIMAL_COMMA, last)):
         raise CorrmatError(f"{path}: numbers like 1,5 need a decimal point")
-    if lines[0].isdigit():  # the number of points, in XYZ files
-        del lines[0]
+    count = int(lines.pop(0)) if lines[0].isdigit() else 0  # of points, in PTS and XYZ files
     sample = "".join(lines[1:2] or lines)  # a row, below the header if there is one
     separator = next((mark for mark in ";," if mark in sample), None)
     columns = [0, 1, 2]
@@ -323,6 +322,8 @@ def _text(path: Path) -> np.ndarray:
             columns = [names.index(axis) for axis in "xyz"]
     if not lines:
         return np.empty((0, 3))
+    if len(lines) < count:
+        raise CorrmatError(f"{path} is cut short: {len(lines)} of {count} points")
     try:
         return np.loadtxt(lines, np.float64, comments=None, delimiter=separator, usecols=columns,
                           ndmin=2, quotechar='"')  # fmt: skip

@@ -6,6 +6,7 @@ refined like a candidate, and half turns of it are among them.
 """
 
 import functools
+import hashlib
 import multiprocessing
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -22,7 +23,7 @@ from torch.utils.data import DataLoader
 
 from corrmat import weights
 from corrmat.data.datamodule import PairDataset, RegistrationDataModule
-from corrmat.networks.verification import VerificationNetwork
+from corrmat.networks.verification import EVIDENCE, VerificationNetwork
 from corrmat.ops import rigid
 from corrmat.progress import track
 from corrmat.registration import benchmark
@@ -80,7 +81,9 @@ def train_verification(
         workers: processes that make candidates; 0 makes them in this one.
     """
     today, verified = commit(), weights.checksum(weights.load_model())
-    folder = runs / f"verification-{verified}" / data
+    made_by = repr((SIZES, PROTOCOLS, STRETCH, RIGHT, CHOICE_WEIGHTS, VERIFIED, EVIDENCE))
+    made_by = hashlib.sha256(made_by.encode()).hexdigest()[:8]  # others would be other candidates
+    folder = runs / f"verification-{verified}-{made_by}" / data
     count = min(pairs, SHARD_PAIRS)
     shards = {n: folder / f"{seed}-{n}-{count}.pt" for n in range(-(-pairs // SHARD_PAIRS))}
     missing = {number: path for number, path in shards.items() if not path.is_file()}
