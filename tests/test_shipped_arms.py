@@ -67,7 +67,7 @@ def test_a_shipped_arm_matches_as_its_record_says(model):
     record = read_record(folder / "metrics.json")
     assert record.data == "shapes"
     settings = load(record.id, record.scale).arms[about["arm"]]
-    few = settings.data.as_dict() | {"test_shapes": PAIRS}  # frozen pairs: the same as of all shapes
+    few = settings.data.as_dict() | {"test_shapes": PAIRS}  # of which the pairs are the same
     module = RegistrationDataModule(**few, seed=settings.seed)
     dataset = module.test_dataloader().dataset
     assert isinstance(dataset, PairDataset)
