@@ -81,7 +81,7 @@ format: .venv/ready  ## let ruff rewrite what it can
 	$(BIN)/ruff check --fix . && $(BIN)/ruff format .
 
 test: .venv/ready  ## everything but the slow learning tests, smoke training of every experiment included
-	$(BIN)/pytest --numprocesses auto --maxprocesses 8 --dist worksteal --nbmake tests notebooks
+	$(BIN)/pytest --numprocesses auto --maxprocesses 8 --dist worksteal --nbmake notebooks tests
 
 test-slow: .venv/ready  ## learning, kill -9 at any moment, SLURM, Ray, all checksums
 	$(BIN)/pytest -m slow

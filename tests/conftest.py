@@ -12,7 +12,9 @@ from corrmat.training import console, recipe
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = Path(os.environ.get("CORRMAT_SHARED", ROOT.parent / "shared"))
 
-torch.set_num_threads(1)  # tensors here are tiny, and a second thread only waits
+# Tensors here are tiny, and a second thread only waits; so it does in the processes of tests.
+torch.set_num_threads(1)
+os.environ["OMP_NUM_THREADS"] = "1"
 os.environ["WANDB_MODE"] = "disabled"
 os.environ["no_proxy"] = "127.0.0.1,localhost"  # the tests' own servers
 
