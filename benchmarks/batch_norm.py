@@ -21,7 +21,7 @@ from corrmat.reporting.intervals import estimates, pair_errors
 from corrmat.reporting.writer import pair_rows
 from corrmat.revision import commit
 from corrmat.training.fit import score
-from corrmat.training.preflight import build_method, prepare
+from corrmat.training.preflight import Arm, build_method, prepare
 from corrmat.training.recipe import load
 from corrmat.weights import load_model, load_state
 
@@ -34,6 +34,11 @@ def use_statistics_of_batches(method: Method) -> None:
     for module in method.modules():
         if isinstance(module, nn.BatchNorm1d):
             module.running_mean = module.running_var = None
+
+
+def test(method: Method, arm: Arm) -> dict[str, dict[str, float]]:
+    """Test a network, and return its median error and its matches, with intervals."""
+    return estimates(pair_errors(pair_rows(arm.name, score(method, arm))))
 
 
 def main(identity: str, name: str, model: str) -> None:
@@ -50,10 +55,9 @@ def main(identity: str, name: str, model: str) -> None:
     arm = prepare(load(path, "overnight", {}, [arm_name]).arms[arm_name])
     method = build_method(arm.settings)
     load_state(method.network, load_model(model).state_dict())
-    running = estimates(pair_errors(pair_rows(arm.name, score(method, arm))))
+    running = test(method, arm)
     use_statistics_of_batches(method)
-    batch = estimates(pair_errors(pair_rows(arm.name, score(method, arm))))
-    result = {"commit": today, "running": running, "batch": batch}
+    result = {"commit": today, "running": running, "batch": test(method, arm)}
     update_json(PATH, f"{identity} {name}", result)
     print(json.dumps(result, indent=1))
 

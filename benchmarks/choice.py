@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from rich.progress import track
 
 from corrmat.files import replace_json
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG
 from corrmat.networks.invariant import InvariantNetwork
 from corrmat.ops import rigid
+from corrmat.progress import track
 from corrmat.registration import benchmark
 from corrmat.registration.choice import (
     CHOICE_WEIGHTS,
@@ -158,10 +158,7 @@ def main() -> None:
     content: dict[str, object] = {"commit": commit(), "points": 512}
     for protocol, count in PAIRS.items():
         pairs = held_out_pairs(protocol, count, _SEED)
-        tables = [
-            tables_of(pairs, index, generate)
-            for index in track(range(len(pairs)), protocol, transient=True)
-        ]
+        tables = [tables_of(pairs, index, generate) for index in track(range(len(pairs)), protocol)]
         rows = [outcomes(table) for table in tables]
         means = np.mean([table.right_matches for table in tables], 0).round(4).tolist()
         content[protocol] = {

@@ -19,10 +19,10 @@ from pathlib import Path
 
 import numpy as np
 import open3d as o3d
-from rich.progress import track
 
 from corrmat.baselines import FpfhSettings, KissSettings, fpfh_ransac, kiss_matcher
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG
+from corrmat.progress import track
 from corrmat.registration import benchmark, choice
 from corrmat.registration.choice import CHOICE_WEIGHTS, LARGE_CLOUDS, ChoiceWeights
 from corrmat.registration.hypotheses import NetworkHypotheses
@@ -98,7 +98,7 @@ PIPELINES: dict[str, Callable[[np.ndarray, np.ndarray, float], tuple[np.ndarray,
 def run(pairs: PairBatch, name: str, voxel: float) -> ModelResult:
     """Register all pairs with one pipeline, refined on all points."""
     outcomes = []
-    for index in track(range(len(pairs)), f"{name}, {voxel}", transient=True):
+    for index in track(range(len(pairs)), f"{name}, {voxel}"):
         source, target = (c[index].double().numpy() for c in (pairs.source, pairs.target))
         start = time.perf_counter()
         transform, agreement = PIPELINES[name](source, target, voxel)
@@ -111,10 +111,7 @@ def run(pairs: PairBatch, name: str, voxel: float) -> ModelResult:
 def choices(pairs: PairBatch) -> dict[str, dict[str, float]]:
     """Compute recall with the weights of `WEIGHTS`, and without candidates of phase correlation."""
     generate = NetworkHypotheses(load_model())
-    rows = [
-        choices_of(pairs, index, generate)
-        for index in track(range(len(pairs)), "choice", transient=True)
-    ]
+    rows = [choices_of(pairs, index, generate) for index in track(range(len(pairs)), "choice")]
     recalls = {}
     for name in rows[0]:
         angle, adds = np.array([row[name] for row in rows]).T

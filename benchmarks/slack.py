@@ -13,11 +13,11 @@ import sys
 from pathlib import Path
 
 import torch
-from rich.progress import track
 
 from corrmat.files import update_json
 from corrmat.metrics import rotation_error_deg
 from corrmat.networks.rpmnet import AnnealingNet, RPMNetwork
+from corrmat.progress import track
 from corrmat.revision import commit
 from corrmat.training.preflight import prepare
 from corrmat.training.recipe import load
@@ -85,7 +85,7 @@ def main(name: str, model: str, data: str, root: str | None = None) -> None:
     for alpha in (None, *HELD):
         holder = AlphaHolder(alpha)
         hook = network.annealing.register_forward_hook(holder)
-        batches = track(datamodule.test_dataloader(), f"alpha {alpha}", transient=True)
+        batches = track(datamodule.test_dataloader(), f"alpha {alpha}")
         errors = torch.cat([errors_of(network, holder, batch) for batch in batches])
         hook.remove()
         keys = "rotation_error_deg", "translation_error", "true_match_prob", "beta", "alpha"

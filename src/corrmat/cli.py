@@ -277,10 +277,11 @@ def _register_pair(options: Namespace) -> str:
 def _read_scans(options: Namespace) -> "tuple[list[np.ndarray], list[Cloud]]":
     """Read the points of all scans and prepare their clouds; errors name the file."""
     from corrmat.data.scans import read_scan
-    from corrmat.registration.preparation import Cloud
 
     paths = *options.source, options.target
     scans = [read_scan(path, options.seed) for path in paths]
+    from corrmat.registration.preparation import Cloud  # slow, and not needed to refuse a file
+
     named = zip(scans, map(str, paths), strict=True)
     return scans, [Cloud.of(scan, name, options.seed) for scan, name in named]
 
