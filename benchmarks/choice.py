@@ -34,7 +34,7 @@ from corrmat.registration.choice import (
 )
 from corrmat.registration.em_icp import em_icp
 from corrmat.registration.hypotheses import Hypotheses, NetworkHypotheses
-from corrmat.registration.preparation import from_original_units, prepare_clouds, to_original_units
+from corrmat.registration.preparation import prepare_clouds
 from corrmat.registration.shipping import held_out_pairs
 from corrmat.registration.verification import verify
 from corrmat.revision import commit
@@ -78,25 +78,26 @@ class PairTables(NamedTuple):
 def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> PairTables:
     """Refine and measure the candidates of a pair, and the true transform in the same way."""
     source, target = (c[index].double().numpy() for c in (pairs.source, pairs.target))
-    (x, y), scale, subsamples, scorers = prepare_clouds(source, target, 0)
+    clouds = prepare_clouds(source, target, 0)
+    subsamples, scorer = clouds.subsamples, clouds.scorers[0]
     hypotheses = generate(*subsamples, 0)
     truth = rigid.to_homogeneous(pairs.rotation[index], pairs.translation[index])
-    truth = from_original_units(truth, scale, x.centre, y.centre)
+    truth = clouds.from_original_units(truth)
 
     def errors_of(transforms: Iterable[np.ndarray]) -> np.ndarray:
-        in_units = [to_original_units(t, scale, x.centre, y.centre) for t in transforms]
+        in_units = map(clouds.to_original_units, transforms)
         return np.array([benchmark.errors(pairs, index, t) for t in in_units])
 
-    found, measures = find_candidates(hypotheses, subsamples, scorers, half_turns=True)
-    true = refine_some(truth[None], hypotheses, scorers[0])
+    found, measures = find_candidates(hypotheses, clouds, half_turns=True)
+    true = refine_some(truth[None], hypotheses, scorer)
     candidates = np.concatenate([found, true])
-    gicp = [scorers[0].refine(each) for each in candidates]
-    em = [refine_chosen(each, hypotheses, subsamples, scorers) for each in candidates]
+    gicp = [scorer.refine(each) for each in candidates]
+    em = [refine_chosen(each, hypotheses, clouds) for each in candidates]
     return PairTables(
         len(hypotheses.transforms),
-        len(refine_some(hypotheses.transforms, hypotheses, scorers[0])),
+        len(refine_some(hypotheses.transforms, hypotheses, scorer)),
         CandidateTables(
-            np.concatenate([measures, measure(true, hypotheses, subsamples, scorers)]),
+            np.concatenate([measures, measure(true, hypotheses, clouds)]),
             verify(candidates, hypotheses, subsamples),
             np.stack([errors_of(each) for each in (gicp, em)]),
         ),

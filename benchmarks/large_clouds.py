@@ -26,7 +26,7 @@ from corrmat.progress import track
 from corrmat.registration import benchmark, choice
 from corrmat.registration.choice import CHOICE_WEIGHTS, LARGE_CLOUDS, ChoiceWeights
 from corrmat.registration.hypotheses import NetworkHypotheses
-from corrmat.registration.preparation import prepare_clouds, to_original_units
+from corrmat.registration.preparation import prepare_clouds
 from corrmat.registration.scoring import (
     AlignmentScorer,
     refine_coarse_to_fine,
@@ -84,10 +84,10 @@ def kiss(source: np.ndarray, target: np.ndarray, voxel: float) -> tuple[np.ndarr
 
 def phase(source: np.ndarray, target: np.ndarray, voxel: float) -> tuple[np.ndarray, float]:
     """Run phase correlation between the Manhattan frames alone, on a grid of its own."""
-    (x, y), scale, _, scorers = prepare_clouds(source, target, 0)
-    (peak,) = scorers[1].phase_correlation.peaks(np.empty((0, 3, 3)), 1)
-    transform, agreement = refined(peak, scorers)
-    return to_original_units(transform, scale, x.centre, y.centre), agreement
+    clouds = prepare_clouds(source, target, 0)
+    (peak,) = clouds.scorers[1].phase_correlation.peaks(np.empty((0, 3, 3)), 1)
+    transform, agreement = refined(peak, clouds.scorers)
+    return clouds.to_original_units(transform), agreement
 
 
 PIPELINES: dict[str, Callable[[np.ndarray, np.ndarray, float], tuple[np.ndarray, float]]] = {
@@ -125,23 +125,22 @@ def choices_of(
 ) -> dict[str, tuple[float, float]]:
     """Return the errors, degrees and ADD-S, of one pair for every choice."""
     source, target = (c[index].double().numpy() for c in (pairs.source, pairs.target))
-    (x, y), scale, subsamples, scorers = prepare_clouds(source, target, 0)
-    hypotheses = generate(*subsamples, 0)
-    own = choice.refine_some(hypotheses.transforms, hypotheses, scorers[0])
-    own_measures = choice.measure(own, hypotheses, subsamples, scorers)
-    found, measures = choice.find_candidates(hypotheses, subsamples, scorers, half_turns=True)
+    clouds = prepare_clouds(source, target, 0)
+    hypotheses = generate(*clouds.subsamples, 0)
+    own = choice.refine_some(hypotheses.transforms, hypotheses, clouds.scorers[0])
+    own_measures = choice.measure(own, hypotheses, clouds)
+    found, measures = choice.find_candidates(hypotheses, clouds, half_turns=True)
 
     def chosen(among: np.ndarray, measured: np.ndarray, weights: ChoiceWeights) -> np.ndarray:
         best = choice.choose(
-            measured, weights, lambda some: verify(among[some], hypotheses, subsamples)
+            measured, weights, lambda some: verify(among[some], hypotheses, clouds.subsamples)
         )
         return among[best]
 
     @functools.cache
     def errors(transform: bytes) -> tuple[float, float]:
         matrix = np.frombuffer(transform).reshape(4, 4).copy()
-        final = choice.refine_chosen(matrix, hypotheses, subsamples, scorers)
-        final = to_original_units(final, scale, x.centre, y.centre)
+        final = clouds.to_original_units(choice.refine_chosen(matrix, hypotheses, clouds))
         return benchmark.errors(pairs, index, final)
 
     alone = "the network's candidates, no half turns"

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from corrmat.data.scan_pairs import make_room_pair
 from corrmat.ops import rigid
 from corrmat.registration.phase_correlation import PhaseCorrelation, highest_peaks, manhattan_frame
-from corrmat.registration.preparation import from_original_units, prepare_clouds
+from corrmat.registration.preparation import prepare_clouds
 
 
 @pytest.fixture
@@ -104,8 +104,7 @@ def test_a_far_stray_point_does_not_make_the_grid_large(corner):
 
 def test_the_right_shift_of_a_room_is_among_the_peaks():
     room = make_room_pair(218, 20_000, "val")
-    (x, y), scale, _, scorers = prepare_clouds(room.source, room.target, 0)
-    truth = rigid.to_homogeneous(room.rotation, room.translation)
-    truth = from_original_units(truth, scale, x.centre, y.centre)
-    peaks = scorers[1].phase_correlation.peaks(np.empty((0, 3, 3)), 16)
+    clouds = prepare_clouds(room.source, room.target, 0)
+    truth = clouds.from_original_units(rigid.to_homogeneous(room.rotation, room.translation))
+    peaks = clouds.scorers[1].phase_correlation.peaks(np.empty((0, 3, 3)), 16)
     assert np.linalg.norm(peaks - truth, axis=(1, 2)).min() < 0.2

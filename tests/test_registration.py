@@ -792,58 +792,50 @@ def test_half_a_turn_of_the_best_candidate_is_a_candidate_too():
     box[np.arange(600), np.arange(600) % 3] = np.sign(box[:, 0])
     box *= 1.2, 0.8, 0.5
     truth = rigid.to_homogeneous(Rotation.from_rotvec([0.3, -0.5, 1.0]).as_matrix(), np.ones(3))
-    (x, y), scale, subsamples, scorers = preparation.prepare_clouds(
-        box, box @ truth[:3, :3].T + truth[:3, 3], 0
-    )
-    truth = preparation.from_original_units(truth, scale, x.centre, y.centre)
-    turns = choice.half_turned(truth, subsamples)
+    clouds = preparation.prepare_clouds(box, box @ truth[:3, :3].T + truth[:3, 3], 0)
+    truth = clouds.from_original_units(truth)
+    turns = choice.half_turned(truth, clouds.subsamples)
     half = turns @ np.linalg.inv(truth)
     np.testing.assert_allclose(half @ half, [np.eye(4)] * 3, atol=1e-9)
     np.testing.assert_allclose(np.trace(half, axis1=1, axis2=2), 0, atol=1e-9)
     for turn in turns:
         mistaken = Hypotheses(turn[None], np.empty((0, 2), int), np.empty(0))
-        clouds = subsamples, scorers
-        found, measures = choice.find_candidates(mistaken, *clouds, half_turns=True)
+        found, measures = choice.find_candidates(mistaken, clouds, half_turns=True)
         assert len(found) == len(measures) == 4
         assert np.linalg.norm(found - truth, axis=(1, 2)).min() < 0.01
-        assert len(choice.find_candidates(mistaken, *clouds, half_turns=False)[0]) == 1
+        assert len(choice.find_candidates(mistaken, clouds, half_turns=False)[0]) == 1
 
 
 def test_a_fragment_of_a_room_that_lies_right_stays_there():
     """EM-ICP alone slides it along its walls."""
     room = make_room_pair(12, 20_000, "val")
-    (x, y), scale, subsamples, scorers = preparation.prepare_clouds(room.source, room.target, 0)
-    assert [len(scorer.source) for scorer in scorers] == [*preparation.LEVELS]
-    hypotheses = NetworkHypotheses(load_model())(*subsamples, 0)
-    truth = rigid.to_homogeneous(room.rotation, room.translation)
-    right = preparation.from_original_units(truth, scale, x.centre, y.centre)
-
-    def in_metres(transform):
-        return preparation.to_original_units(transform, scale, x.centre, y.centre)
-
-    assert moved_m(room, in_metres(em_icp(right, *subsamples, hypotheses.prob))) > 0.1
-    refined = choice.refine_chosen(right, hypotheses, subsamples, scorers)
-    assert moved_m(room, in_metres(refined)) < 0.01
+    clouds = preparation.prepare_clouds(room.source, room.target, 0)
+    assert [len(scorer.source) for scorer in clouds.scorers] == [*preparation.LEVELS]
+    hypotheses = NetworkHypotheses(load_model())(*clouds.subsamples, 0)
+    right = clouds.from_original_units(rigid.to_homogeneous(room.rotation, room.translation))
+    slid = em_icp(right, *clouds.subsamples, hypotheses.prob)
+    assert moved_m(room, clouds.to_original_units(slid)) > 0.1
+    refined = choice.refine_chosen(right, hypotheses, clouds)
+    assert moved_m(room, clouds.to_original_units(refined)) < 0.01
 
 
 def test_the_choice_is_by_agreement_coherence_unmatched_loss_and_support(pair):
     """Of the truth and a half turn, put first, the truth wins, and by each measure's own weight."""
     _, source, target, truth = pair
-    (x, y), scale, subsamples, scorers = preparation.prepare_clouds(source, target, 0)
-    hypotheses = NetworkHypotheses(load_model())(*subsamples, 0)
-    prepared = preparation.from_original_units(truth, scale, x.centre, y.centre)
-    back = preparation.to_original_units(prepared, scale, x.centre, y.centre)
-    np.testing.assert_allclose(back, truth, atol=1e-9)
+    clouds = preparation.prepare_clouds(source, target, 0)
+    hypotheses = NetworkHypotheses(load_model())(*clouds.subsamples, 0)
+    prepared = clouds.from_original_units(truth)
+    np.testing.assert_allclose(clouds.to_original_units(prepared), truth, atol=1e-9)
     transforms = np.stack([prepared] * 2)
     transforms[0, :3, :3] @= np.diag([-1.0, -1.0, 1.0])
-    wrong, right = choice.measure(transforms, hypotheses, subsamples, scorers)
+    wrong, right = choice.measure(transforms, hypotheses, clouds)
     better = np.sign([1.0, *choice.CHOICE_WEIGHTS[:-1]]) * (right - wrong)
     assert (better[[0, 2, 3]] > 0).all()
     measures = np.stack([wrong, right])
     assert choice.choose(measures, choice.CHOICE_WEIGHTS, np.zeros_like) == 1
-    wrongly, rightly = verify(transforms, hypotheses, subsamples)
+    wrongly, rightly = verify(transforms, hypotheses, clouds.subsamples)
     assert rightly > wrongly
-    assert not verify(transforms, hypotheses._replace(verification=None), subsamples).any()
+    assert not verify(transforms, hypotheses._replace(verification=None), clouds.subsamples).any()
 
 
 def registered(room):

@@ -31,8 +31,9 @@ def pairs():
 @pytest.fixture(scope="module")
 def registered(generate, pairs):
     source, target = (c[0].double().numpy() for c in (pairs.source, pairs.target))
-    _, _, subsamples, (scorer,) = prepare_clouds(source, target, 0)
-    return generate(*subsamples, 0), subsamples, scorer
+    clouds = prepare_clouds(source, target, 0)
+    (scorer,) = clouds.scorers
+    return generate(*clouds.subsamples, 0), clouds.subsamples, scorer
 
 
 def test_the_order_of_points_does_not_matter():

@@ -1,6 +1,6 @@
 """The choice among a model's candidates, and the refinement of the chosen one."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -9,7 +9,7 @@ from corrmat.ops import rigid
 from corrmat.registration.em_icp import WIDTHS, em_icp
 from corrmat.registration.hypotheses import Hypotheses
 from corrmat.registration.phase_correlation import PhaseCorrelation
-from corrmat.registration.preparation import MODEL_POINTS
+from corrmat.registration.preparation import MODEL_POINTS, PreparedClouds
 from corrmat.registration.scoring import (
     COARSE_POINTS,
     LEVELS,
@@ -51,42 +51,35 @@ def distinct(transforms: np.ndarray) -> np.ndarray:
     return kept
 
 
-def phase_correlation(
-    hypotheses: Hypotheses, scorers: Sequence[AlignmentScorer]
-) -> PhaseCorrelation | None:
+def phase_correlation(hypotheses: Hypotheses, clouds: PreparedClouds) -> PhaseCorrelation | None:
     """Return the phase correlation of two clouds, for models with matches; else None.
 
     Its grid is too fine for two small clouds: there it is None as well.
     """
-    if hypotheses.prob is None or len(scorers) == 1:
+    if hypotheses.prob is None or len(clouds.scorers) == 1:
         return None
-    return scorers[1].phase_correlation
+    return clouds.scorers[1].phase_correlation
 
 
-def correlation_of_large(
-    hypotheses: Hypotheses, scorers: Sequence[AlignmentScorer]
-) -> PhaseCorrelation | None:
+def correlation_of_large(hypotheses: Hypotheses, clouds: PreparedClouds) -> PhaseCorrelation | None:
     """Return the phase correlation if both clouds are large; else None.
 
     Where one is small, it finds candidates, but says little of how good they are.
     """
-    fewest = min(len(scorers[-1].source), len(scorers[-1].target))
-    return phase_correlation(hypotheses, scorers) if fewest > LEVELS[0] else None
+    full = clouds.scorers[-1]
+    large = min(len(full.source), len(full.target)) > LEVELS[0]
+    return phase_correlation(hypotheses, clouds) if large else None
 
 
-def weights_for(hypotheses: Hypotheses, scorers: Sequence[AlignmentScorer]) -> ChoiceWeights:
+def weights_for(hypotheses: Hypotheses, clouds: PreparedClouds) -> ChoiceWeights:
     """Return the weights of the choice among a model's candidates."""
-    if correlation_of_large(hypotheses, scorers):
+    if correlation_of_large(hypotheses, clouds):
         return LARGE_CLOUDS
     return WITHOUT_MATCHABILITIES if hypotheses.unmatched_nll is None else CHOICE_WEIGHTS
 
 
 def find_candidates(
-    hypotheses: Hypotheses,
-    subsamples: tuple[np.ndarray, np.ndarray],
-    scorers: Sequence[AlignmentScorer],
-    *,
-    half_turns: bool,
+    hypotheses: Hypotheses, clouds: PreparedClouds, *, half_turns: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """Refine and measure hypotheses, drop copies, and add what the best may be mistaken for.
 
@@ -96,29 +89,28 @@ def find_candidates(
 
     Args:
         hypotheses: of the model.
-        subsamples: the clouds that they were made from.
-        scorers: of the clouds, of more and more of their points.
+        clouds: that they were made from.
         half_turns: whether to add them. Only a verification network can tell them from the right
             transform; the measures cannot.
 
     Returns:
         Transforms (T, 4, 4), half turns last, and their measures (T, 5).
     """
-    scorer = scorers[0]
-    correlation = phase_correlation(hypotheses, scorers)
+    scorer = clouds.scorers[0]
+    correlation = phase_correlation(hypotheses, clouds)
     transforms = hypotheses.transforms
     if correlation:
         peaks = correlation.peaks(transforms[:, :3, :3], PEAKS)
         transforms = np.concatenate([transforms, peaks])
     refined = refine_some(transforms, hypotheses, scorer)
-    measures = measure(refined, hypotheses, subsamples, scorers)
+    measures = measure(refined, hypotheses, clouds)
     if not half_turns:
         return refined, measures
-    weights = weights_for(hypotheses, scorers)
+    weights = weights_for(hypotheses, clouds)
     best = refined[best_by_measures(measures, weights, HALF_TURNED)]
-    turned = np.concatenate([half_turned(each, subsamples) for each in best])
+    turned = np.concatenate([half_turned(each, clouds.subsamples) for each in best])
     candidates = distinct(np.concatenate([refined, refine_some(turned, hypotheses, scorer)]))
-    added = measure(candidates[len(refined) :], hypotheses, subsamples, scorers)
+    added = measure(candidates[len(refined) :], hypotheses, clouds)
     return candidates, np.concatenate([measures, added])
 
 
@@ -149,30 +141,24 @@ def half_turned(transform: np.ndarray, subsamples: tuple[np.ndarray, np.ndarray]
     return rigid.to_homogeneous(rotation, centre - rotation @ centre) @ transform
 
 
-def measure(
-    transforms: np.ndarray,
-    hypotheses: Hypotheses,
-    subsamples: tuple[np.ndarray, np.ndarray],
-    scorers: Sequence[AlignmentScorer],
-) -> np.ndarray:
+def measure(transforms: np.ndarray, hypotheses: Hypotheses, clouds: PreparedClouds) -> np.ndarray:
     """Measure what the choice among transforms weighs.
 
     Args:
         transforms: (T, 4, 4).
         hypotheses: of the model.
-        subsamples: the clouds that they were made from.
-        scorers: of the clouds; the first points of each are the model's.
+        clouds: that they were made from.
 
     Returns:
         (T, 5): agreement, coherence, unmatched loss, support, and phase correlation (0 unless
         both clouds are large).
     """
-    correlation = correlation_of_large(hypotheses, scorers)
+    correlation = correlation_of_large(hypotheses, clouds)
     rows = []
     for transform in transforms:
-        agreement, coherence, distances = scorers[0].alignment(transform)
+        agreement, coherence, distances = clouds.scorers[0].alignment(transform)
         unmatched = hypotheses.unmatched_loss(distances)
-        support = hypotheses.support(transform, *subsamples)
+        support = hypotheses.support(transform, *clouds.subsamples)
         height = correlation.at(transform) if correlation else 0.0
         rows.append((agreement, coherence, unmatched, support, height))
     return np.reshape(rows, (-1, 5))
@@ -208,10 +194,7 @@ def weigh(measures: np.ndarray, weights: ChoiceWeights) -> np.ndarray:
 
 
 def refine_chosen(
-    transform: np.ndarray,
-    hypotheses: Hypotheses,
-    subsamples: tuple[np.ndarray, np.ndarray],
-    scorers: Sequence[AlignmentScorer],
+    transform: np.ndarray, hypotheses: Hypotheses, clouds: PreparedClouds
 ) -> np.ndarray:
     """Refine the chosen transform (4, 4) by EM-ICP, on a few points and then on all of the model's.
 
@@ -226,20 +209,20 @@ def refine_chosen(
     Args:
         transform: of the source onto the target.
         hypotheses: from which it was chosen.
-        subsamples: the clouds that they were made from.
-        scorers: of the clouds, of more and more of their points.
+        clouds: that they were made from.
     """
-    correlation = correlation_of_large(hypotheses, scorers)
+    scorers = clouds.scorers
+    correlation = correlation_of_large(hypotheses, clouds)
     if correlation:
         return refine_coarse_to_fine(correlation.shifted(transform), scorers)
     chosen = transform
-    source, target = (cloud[:COARSE_POINTS] for cloud in subsamples)
+    source, target = (cloud[:COARSE_POINTS] for cloud in clouds.subsamples)
     prob = hypotheses.prob
     some = None if prob is None else prob[: len(source), : len(target)]
     transform = em_icp(transform, source, target, some)
-    if max(map(len, subsamples)) > COARSE_POINTS:
+    if max(map(len, clouds.subsamples)) > COARSE_POINTS:
         widths = WIDTHS if prob is None else WIDTHS[-FINE_ITERATIONS:]
-        transform = em_icp(transform, *subsamples, prob, widths)
+        transform = em_icp(transform, *clouds.subsamples, prob, widths)
     full = scorers[-1]
     if len(scorers) > 1:
         refined = [refine_coarse_to_fine(each, scorers) for each in (chosen, transform)]

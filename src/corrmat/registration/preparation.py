@@ -17,26 +17,6 @@ FAR = 30.0  # median distances from the middle: a point beyond is a stray one an
 _LINE = 1e-6  # a cloud that is thinner, relative to its length, is a line
 
 
-class PreparedClouds(NamedTuple):
-    """Two clouds as the model and the choice among its hypotheses see them."""
-
-    clouds: "tuple[Cloud, Cloud]"
-    scale: float  # from the user's units to those in which a cloud's radius is about one
-    subsamples: tuple[np.ndarray, np.ndarray]  # (N, 6) and (M, 6), for the model
-    scorers: list[AlignmentScorer]  # of more and more points
-
-
-def prepare_clouds(
-    source: "np.ndarray | Cloud", target: "np.ndarray | Cloud", seed: int
-) -> PreparedClouds:
-    """Check, centre, scale and subsample two clouds; see `register`."""
-    x, y = Cloud.of(source, "source", seed), Cloud.of(target, "target", seed)
-    scale = 2 * MEDIAN / (x.median + y.median)
-    subsamples = x.with_normals(scale, MODEL_POINTS), y.with_normals(scale, MODEL_POINTS)
-    scorers = scorers_of_levels(x.points(scale, FULL_POINTS), y.points(scale, FULL_POINTS))
-    return PreparedClouds((x, y), scale, subsamples, scorers)
-
-
 class Cloud:
     """At most `FULL_POINTS` points of a user's cloud, in canonical order, and their centroid.
 
@@ -117,6 +97,41 @@ class Cloud:
         return np.hstack([points, given if given.shape[1] else estimate_normals(points)])
 
 
+class PreparedClouds(NamedTuple):
+    """Two clouds as the model and the choice among its hypotheses see them."""
+
+    source: Cloud
+    target: Cloud
+    scale: float  # from the user's units to those in which a cloud's radius is about one
+    subsamples: tuple[np.ndarray, np.ndarray]  # (N, 6) and (M, 6), for the model
+    scorers: list[AlignmentScorer]  # of more and more points; the first of each are the model's
+
+    def to_original_units(self, transform: np.ndarray) -> np.ndarray:
+        """Convert a transform (4, 4) of the prepared clouds to the user's coordinates."""
+        converted = transform.copy()
+        moved = transform[:3, :3] @ self.source.centre
+        converted[:3, 3] = self.target.centre + transform[:3, 3] / self.scale - moved
+        return converted
+
+    def from_original_units(self, transform: np.ndarray) -> np.ndarray:
+        """Convert a transform (4, 4) of the user's coordinates to the prepared clouds."""
+        converted = transform.copy()
+        moved = transform[:3, :3] @ self.source.centre + transform[:3, 3]
+        converted[:3, 3] = self.scale * (moved - self.target.centre)
+        return converted
+
+
+def prepare_clouds(
+    source: np.ndarray | Cloud, target: np.ndarray | Cloud, seed: int
+) -> PreparedClouds:
+    """Check, centre, scale and subsample two clouds; see `register`."""
+    x, y = Cloud.of(source, "source", seed), Cloud.of(target, "target", seed)
+    scale = 2 * MEDIAN / (x.median + y.median)
+    subsamples = x.with_normals(scale, MODEL_POINTS), y.with_normals(scale, MODEL_POINTS)
+    scorers = scorers_of_levels(x.points(scale, FULL_POINTS), y.points(scale, FULL_POINTS))
+    return PreparedClouds(x, y, scale, subsamples, scorers)
+
+
 def is_near(points: np.ndarray, different: np.ndarray, name: str = "cloud") -> np.ndarray:
     """Tell which points are no stray ones: (N,) bool.
 
@@ -146,22 +161,3 @@ def _hash(values: np.ndarray, seed: int) -> np.ndarray:
         state = (state ^ state >> np.uint64(27)) * np.uint64(0x94D049BB133111EB)
         state ^= state >> np.uint64(31)
     return state
-
-
-def to_original_units(
-    transform: np.ndarray, scale: float, centre_x: np.ndarray, centre_y: np.ndarray
-) -> np.ndarray:
-    """Convert a transform of centred, scaled clouds to the user's coordinates."""
-    converted = transform.copy()
-    converted[:3, 3] = centre_y + transform[:3, 3] / scale - transform[:3, :3] @ centre_x
-    return converted
-
-
-def from_original_units(
-    transform: np.ndarray, scale: float, centre_x: np.ndarray, centre_y: np.ndarray
-) -> np.ndarray:
-    """Convert a transform of the user's coordinates to centred, scaled clouds."""
-    converted = transform.copy()
-    rotation, translation = transform[:3, :3], transform[:3, 3]
-    converted[:3, 3] = scale * (rotation @ centre_x + translation - centre_y)
-    return converted

@@ -20,7 +20,7 @@ from corrmat.registration.choice import (
     weights_for,
 )
 from corrmat.registration.hypotheses import CLASSICAL, HypothesisGenerator, NetworkHypotheses
-from corrmat.registration.preparation import Cloud, prepare_clouds, to_original_units
+from corrmat.registration.preparation import Cloud, prepare_clouds
 from corrmat.registration.result import Registration
 from corrmat.registration.verification import verify
 from corrmat.weights import load_model
@@ -74,37 +74,36 @@ def register(
     else:
         generate = CLASSICAL.get(str(model)) or _load_network(str(model))
     start = time.perf_counter()
-    (x, y), scale, subsamples, scorers = prepare_clouds(source, target, seed)
-    hypotheses = generate(*subsamples, seed)
+    clouds = prepare_clouds(source, target, seed)
+    hypotheses = generate(*clouds.subsamples, seed)
 
     if refine == "icp":
         half_turns = hypotheses.verification is not None
-        candidates, measures = find_candidates(
-            hypotheses, subsamples, scorers, half_turns=half_turns
-        )
+        candidates, measures = find_candidates(hypotheses, clouds, half_turns=half_turns)
     else:
         candidates = hypotheses.transforms
-        measures = measure(candidates, hypotheses, subsamples, scorers)
+        measures = measure(candidates, hypotheses, clouds)
 
     def verified(rows: np.ndarray) -> np.ndarray:
-        return verify(candidates[rows], hypotheses, subsamples)
+        return verify(candidates[rows], hypotheses, clouds.subsamples)
 
-    transform = candidates[choose(measures, weights_for(hypotheses, scorers), verified)]
+    transform = candidates[choose(measures, weights_for(hypotheses, clouds), verified)]
     if refine == "icp":
-        transform = refine_chosen(transform, hypotheses, subsamples, scorers)
-    agreement, coherence, _ = scorers[0].alignment(transform)
-    support = hypotheses.support(transform, *subsamples)
-    agrees = hypotheses.match_support(transform, *subsamples) > 0
-    large = correlation_of_large(hypotheses, scorers)
+        transform = refine_chosen(transform, hypotheses, clouds)
+    agreement, coherence, _ = clouds.scorers[0].alignment(transform)
+    support = hypotheses.support(transform, *clouds.subsamples)
+    agrees = hypotheses.match_support(transform, *clouds.subsamples) > 0
+    large = correlation_of_large(hypotheses, clouds)
     of_large = (coherence, large.at(transform)) if large else (None, None)
     confidence = _calibration().confidence(agreement, support if len(agrees) else None, *of_large)
+    x, y = clouds.source, clouds.target
     fewest = min(len(x.rows), len(y.rows))
     if fewest < FEW_POINTS or (len(agrees) and not agrees.any()):
         confidence = min(confidence, DOUBTFUL)
-    overlap, rmse = scorers[-1].overlap_and_rmse(transform)
+    overlap, rmse = clouds.scorers[-1].overlap_and_rmse(transform)
     rows = [cloud.rows[m] for cloud, m in zip((x, y), hypotheses.matches.T, strict=True)]
     return Registration(
-        transform=to_original_units(transform, scale, x.centre, y.centre),
+        transform=clouds.to_original_units(transform),
         matches=np.stack(rows, 1),
         match_confidence=hypotheses.confidence,
         match_agrees=agrees,
@@ -114,7 +113,7 @@ def register(
         correlation=of_large[1],
         confidence=confidence,
         calibrated=hypotheses.verification is not None and refine == "icp",
-        rmse=rmse / scale,
+        rmse=rmse / clouds.scale,
         overlap=overlap,
         verdict=verdict(confidence, _reason(agrees, overlap, x.median / y.median, fewest)),
         model=str(model),

@@ -36,7 +36,7 @@ from corrmat.registration.choice import (
     refine_some,
 )
 from corrmat.registration.hypotheses import NetworkHypotheses
-from corrmat.registration.preparation import from_original_units, prepare_clouds
+from corrmat.registration.preparation import prepare_clouds
 from corrmat.registration.shipping import recalibrate
 from corrmat.registration.verification import evidence
 from corrmat.revision import commit
@@ -145,19 +145,21 @@ def write_shard(path: Path, number: int, *, data: str, seed: int, count: int) ->
 def candidate_set(pairs: PairBatch, generate: NetworkHypotheses) -> CandidateSet:
     """Register a pair, a batch of one, up to its candidates, and label them."""
     source, target = (c[0].double().numpy() for c in (pairs.source, pairs.target))
-    (x, y), scale, subsamples, scorers = prepare_clouds(source, target, 0)
-    hypotheses = generate(*subsamples, 0)
+    clouds = prepare_clouds(source, target, 0)
+    hypotheses = generate(*clouds.subsamples, 0)
     truth = rigid.to_homogeneous(pairs.rotation[0], pairs.translation[0])
-    truth = from_original_units(truth, scale, x.centre, y.centre)
-    candidates, measures = find_candidates(hypotheses, subsamples, scorers, half_turns=True)
+    truth = clouds.from_original_units(truth)
+    candidates, measures = find_candidates(hypotheses, clouds, half_turns=True)
     best = candidates[best_by_measures(measures, CHOICE_WEIGHTS, VERIFIED)]
-    refined = refine_some(truth[None], hypotheses, scorers[0])
-    half_turns = refine_some(half_turned(refined[0], subsamples), hypotheses, scorers[0])
+    scorer = clouds.scorers[0]
+    refined = refine_some(truth[None], hypotheses, scorer)
+    turned = half_turned(refined[0], clouds.subsamples)
+    half_turns = refine_some(turned, hypotheses, scorer)
     transforms = np.concatenate([best, half_turns, refined])
-    offsets = subsamples[0][:, :3] @ (transforms - truth)[:, :3, :3].transpose(0, 2, 1)
+    offsets = clouds.subsamples[0][:, :3] @ (transforms - truth)[:, :3, :3].transpose(0, 2, 1)
     offsets += (transforms - truth)[:, None, :3, 3]
     right = np.linalg.norm(offsets, axis=2).mean(1) < RIGHT
-    features, points, nearest = evidence(transforms, hypotheses, subsamples)
+    features, points, nearest = evidence(transforms, hypotheses, clouds.subsamples)
     return CandidateSet(features.half(), points.half(), nearest.short(), torch.from_numpy(right))
 
 
