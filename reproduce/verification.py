@@ -3,11 +3,8 @@
 It belongs to the matching weights that ship: after `make weights` it is trained anew.
 """
 
-from jsonargparse import auto_cli
-
 from corrmat.registration.verification_training import train_verification
-from corrmat.training.console import print_messages
+from corrmat.scripts import call
 
 if __name__ == "__main__":
-    print_messages(0)
-    auto_cli(train_verification)
+    call(train_verification)

@@ -317,6 +317,22 @@ def test_evaluate_takes_shipped_weights(capsys):
     assert "fit" in capsys.readouterr().err
 
 
+def test_evaluate_tests_on_all_that_the_record_has(capsys):
+    few = ["--scale", "smoke", "--data.train_shapes", "20", "--data.test_shapes", "8"]
+    for experiment, arm, titles in (
+        ("1.4", "DCP_corr", ["0 to 30 deg", "30 to 60 deg", "150 to 180 deg"]),
+        ("outliers", "DCP_corr_matchability", ["0% outliers", "10% outliers", "40% outliers"]),
+    ):
+        config = str(ROOT / f"configs/exp/{experiment}.yaml")
+        words = ["--config", config, *few, "--arm", arm]
+        assert main(["fit", *words, "--logger", "none"]) == main(["evaluate", *words]) == 0
+        shown = capsys.readouterr().out.splitlines()
+        assert set(titles) <= set(shown)
+        tables = len([line for line in shown if line.endswith((" deg", " outliers"))])
+        tables += experiment == "outliers"  # the recipe's own share comes first
+        assert sum(line.startswith("rotation_error_deg_median") for line in shown) == tables == 6
+
+
 def test_a_page_is_not_written_to_standard_output(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["register", "a.ply", "b.ply", "--html", "-"]) == 2

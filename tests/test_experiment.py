@@ -13,6 +13,7 @@ import re
 import shutil
 import signal
 import socket
+import subprocess
 import sys
 import types
 
@@ -689,11 +690,10 @@ def test_a_machine_that_is_fast_in_bfloat16_trains_in_it(arm, tmp_path, monkeypa
 
 
 @pytest.mark.parametrize(
-    ("devices", "count", "one"),
-    [(4, 4, 1), ("auto", 0, 1), (-1, 0, 1), ("3", 3, 1), ([3, 1], 2, [3]), ("2,5", 2, [2])],
+    ("devices", "one"),
+    [(4, 1), ("auto", 1), (-1, 1), ("3", 1), ([3, 1], [3]), ("2,5", [2])],
 )
-def test_a_test_runs_on_the_first_device_that_is_named(devices, count, one):
-    assert hardware.count_devices(devices) == count
+def test_a_test_runs_on_the_first_device_that_is_named(devices, one):
     assert hardware.first_device(devices) == one
 
 
@@ -715,20 +715,18 @@ def test_batch_norms_keep_their_statistics_from_a_share_of_the_run_on(tmp_path):
     assert tracked == {2 * 2}
 
 
-def test_denormal_numbers_are_zero_in_training_and_nowhere_else(tmp_path, monkeypatch):
-    def tiny():
-        return float(torch.tensor(1e-39) * 1)
-
-    seen, step = [], RegistrationModule.training_step
-
-    def training_step(self, *args):
-        seen.append(tiny())
-        return step(self, *args)
-
-    monkeypatch.setattr(RegistrationModule, "training_step", training_step)
-    train(load("1.2", "--trainer.max_steps", "2").arms["DCP"], tmp_path)
-    assert seen == [0.0, 0.0]
-    assert tiny() > 0
+def test_denormal_numbers_are_zero_in_all_threads_of_a_run():
+    """Threads that torch has started before keep what they started with."""
+    code = """
+import torch
+torch.set_num_threads(2)
+import corrmat.cli
+from corrmat.options import parse
+corrmat.cli.prepare_output(parse(["run", "--config", "x.yaml"]))
+print(int((torch.full((2**18,), 1e-39) * 1).count_nonzero()))
+"""
+    words = sys.executable, "-c", code
+    assert subprocess.run(words, capture_output=True, text=True, check=True).stdout == "0\n"
 
 
 def test_an_interrupted_run_keeps_no_weights_that_are_not_finite(tmp_path, monkeypatch):

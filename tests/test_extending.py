@@ -1,6 +1,7 @@
 """docs/architecture.md's recipes of steps, each followed as a newcomer would."""
 
 import dataclasses
+import errno
 import json
 import os
 import re
@@ -17,6 +18,7 @@ from conftest import ROOT
 from torch import nn
 
 from corrmat import RegistrationDataModule
+from corrmat.cli import exit_code
 from corrmat.data import registry
 from corrmat.data.clouds import CloudSet
 from corrmat.errors import CorrmatError
@@ -142,6 +144,23 @@ def test_a_mistake_inside_a_network_keeps_its_traceback(mine):
         prepare(settings)
     assert caught.traceback[-1].name == "forward"
     assert not isinstance(caught.value, CorrmatError)
+
+
+@pytest.mark.parametrize(
+    ("error", "code"), [(OSError(errno.ENOSPC, "no space left"), 2), (FileNotFoundError(), None)]
+)
+def test_only_a_file_that_cannot_be_written_is_a_line(error, code, capsys):
+    """A missing file may be one that a network of the user's own reads."""
+
+    def run():
+        raise error
+
+    if code is None:
+        with pytest.raises(type(error)):
+            exit_code(run)
+    else:
+        assert exit_code(run) == code
+        assert "no space left" in capsys.readouterr().err
 
 
 def test_a_loss_mixin_behind_the_module_is_named(mine):

@@ -19,6 +19,14 @@ def test_within_radius_takes_the_lowest_indices(chunk, generator, monkeypatch):
         assert torch.equal(actual, within_radius_loops(points, radius, k))
 
 
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_half_precision_has_the_neighbours_of_its_values(dtype, generator):
+    points = torch.randn(1, 20, 3, generator=generator).to(dtype)
+    cloud, exact = points[:, :10], points.double()
+    assert torch.equal(nearest(points, cloud), nearest(exact, exact[:, :10]))
+    assert torch.equal(within_radius(points, 0.8, 4), within_radius(exact, 0.8, 4))
+
+
 def test_the_border_is_inside_and_copies_are_neighbours():
     points = torch.tensor([[[0.0, 0, 0], [0.5, 0, 0], [0.0, 0, 0]]])
     assert within_radius(points, 0.5, 2).tolist() == [[[1, 2], [0, 2], [0, 1]]]

@@ -11,7 +11,6 @@ from corrmat.module import OptimizerSettings
 from corrmat.networks.dcp import DCPNetwork
 from corrmat.networks.rpmnet import RPMNetwork
 from corrmat.training import recipe
-from corrmat.training.experiment import bands
 from corrmat.training.hardware import trainer_options
 from corrmat.training.preflight import build_method
 
@@ -59,7 +58,7 @@ def test_the_frozen_test_pairs_are_the_recipes(path, scale, data):
     experiment = recipe.load(path, scale, {"data": {"data": data} | root})
     assert experiment.test_pairs
     for settings in experiment.arms.values():
-        digest = datamodule_of(settings).test_pairs_digest(bands(experiment.bands_deg))
+        digest = datamodule_of(settings).test_pairs_digest(experiment.test_changes)
         assert digest == experiment.test_pairs
 
 

@@ -116,7 +116,10 @@ def test_the_verification_network_is_trained_goes_on_and_ships(package, tmp_path
     monkeypatch.setattr(verification_training, "recalibrate", lambda: calibrated.append(True))
     monkeypatch.setattr(verification_training, "BATCH_PAIRS", 1)
     options = {"runs": tmp_path / "runs", "data": "shapes", "pairs": 6, "steps": 2, "workers": 0}
-    assert load_verification(load_model()) is None
+    train_verification(**options)
+    assert load_verification(load_model()) is None, "a trial does not ship"
+    for name in ("data", "pairs", "steps"):
+        monkeypatch.setattr(verification_training, name.upper(), options[name])
     train_verification(**options)
     verification = load_verification(load_model())
     assert verification is not None

@@ -4,13 +4,14 @@ import contextlib
 import os
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from jsonargparse import Namespace
 
-from corrmat.errors import CorrmatError
+from corrmat.errors import CorrmatError, cannot_write
 from corrmat.options import EXPERIMENT_COMMANDS, SHORT_HELP, build_parser, parse
 
 if TYPE_CHECKING:
@@ -44,7 +45,9 @@ def exit_code(run: Callable[[], int]) -> int:
     except BrokenPipeError:  # the reader of our output has closed it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except OSError as error:  # a full disk, a folder without permission
+    except OSError as error:
+        if not cannot_write(error):
+            raise
         print(f"corrmat: error: {error}", file=sys.stderr)
         return 2
 
@@ -88,7 +91,6 @@ def fit_arm(options: Namespace) -> int:
 def _evaluate(options: Namespace) -> int:
     """Test the checkpoint of one arm."""
     loaded = _load_arm(options)
-    from corrmat.metrics import summary
     from corrmat.training import experiment, fit, preflight, runs
     from corrmat.weights import load_model, load_state
 
@@ -113,12 +115,15 @@ def _evaluate(options: Namespace) -> int:
         method = preflight.build_method(arm.settings)
         load_state(method.network, network.state_dict())
     print(f"checkpoint: {checkpoint}")
-    tests = fit.score(method, arm, experiment.bands(loaded.bands_deg))
-    for band, per_pair in enumerate(tests):
-        if loaded.bands_deg:
-            print(f"\n{loaded.bands_deg[band]:g} to {loaded.bands_deg[band + 1]:g} deg")
-        for metric, value in summary(per_pair).items():
-            print(f"{metric:28s} {value:.6g}")
+    _, result = experiment.evaluate(method, arm, loaded)
+    titles = [f"{low:g} to {high:g} deg" for low, high in pairwise(loaded.bands_deg)]
+    titles += [f"{share:.0%} outliers" for share in loaded.sweep_outliers]
+    parts = dict(zip(titles, [*result.bands, *result.sweep], strict=True))
+    if not result.bands:
+        _print_metrics(result.metrics)
+    for title, part in parts.items():
+        print(f"\n{title}")
+        _print_metrics(part.metrics)
     return 0
 
 
@@ -132,6 +137,11 @@ def _load_arm(options: Namespace) -> "Recipe":
     return recipe.load(config, options.scale, options.overrides, arms)
 
 
+def _print_metrics(metrics: Mapping[str, float]) -> None:
+    for name, value in metrics.items():
+        print(f"{name:28s} {value:.6g}")
+
+
 def _required_config(options: Namespace) -> Path:
     if options.config is None:
         raise CorrmatError("which experiment? --config configs/exp/1.1.yaml")
@@ -139,10 +149,11 @@ def _required_config(options: Namespace) -> Path:
 
 
 def prepare_output(options: Namespace) -> None:
-    """Choose what is printed while an experiment runs."""
+    """Choose what is printed while an experiment runs, and how the CPU computes."""
     from corrmat.training import console, fit, hardware
 
     fit.silence_libraries()
+    hardware.flush_denormals()
     verbosity = int(options.get("verbose", False)) - int(options.get("quiet", False))
     console.print_messages(verbosity if hardware.is_first_process() else -1)
 

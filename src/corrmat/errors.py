@@ -1,6 +1,7 @@
 """The one error type that users see, and the checks that settings and networks share."""
 
 import dataclasses
+import errno
 import re
 import textwrap
 import typing
@@ -11,8 +12,22 @@ class CorrmatError(Exception):
     """User input cannot be used. The message names the input and says what to do."""
 
 
+_WHILE_WRITING = {
+    errno.EACCES, errno.EDQUOT, errno.EEXIST, errno.EFBIG, errno.EIO, errno.EISDIR,
+    errno.ENAMETOOLONG, errno.ENOSPC, errno.ENOTDIR, errno.EPERM, errno.EROFS,
+}  # fmt: skip
+
+
 class DivergedError(CorrmatError):
     """A training loss is not finite."""
+
+
+def cannot_write(error: OSError) -> bool:
+    """Tell whether an error is of a file that cannot be written: a full disk, a folder's rights.
+
+    Others, such as of a missing file, may be of a network of the user's own.
+    """
+    return error.errno in _WHILE_WRITING
 
 
 def short_message(error: Exception) -> str:

@@ -1,10 +1,10 @@
 """What the scripts of reproduce/ run; their options are those of `corrmat run`."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from jsonargparse import Namespace
+from jsonargparse import Namespace, auto_cli
 
 from corrmat.cli import exit_code, fit_arm, main, prepare_output
 from corrmat.options import parse
@@ -88,6 +88,19 @@ def train_weights() -> None:
             facts = runs.trained_facts(folder)
             shipping.ship(folder / "last.ckpt", facts, results, start=arm.start, seed=arm.seed)
             runs.mark_recorded(folder)  # the next run starts from these weights
+        return 0
+
+    sys.exit(exit_code(run))
+
+
+def call(function: Callable[..., None]) -> None:
+    """Call a function with the script's options: reproduce/verification.py, calibration.py."""
+
+    def run() -> int:
+        from corrmat.training.console import print_messages
+
+        print_messages(0)
+        auto_cli(function)
         return 0
 
     sys.exit(exit_code(run))

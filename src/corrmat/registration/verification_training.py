@@ -7,6 +7,7 @@ refined like a candidate, and half turns of it are among them.
 
 import functools
 import hashlib
+import io
 import multiprocessing
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -23,6 +24,7 @@ from torch.utils.data import DataLoader
 
 from corrmat import weights
 from corrmat.data.datamodule import PairDataset, RegistrationDataModule
+from corrmat.files import replace_bytes
 from corrmat.networks.verification import EVIDENCE, VerificationNetwork
 from corrmat.ops import rigid
 from corrmat.progress import track
@@ -45,6 +47,8 @@ from corrmat.types import PairBatch
 SIZES = 512, 560, 640, 768, 1024  # points of a cloud before it is cropped
 PROTOCOLS: tuple[benchmark.Protocol, ...] = ("real", "views", "real", "views", "real", "clean")
 STRETCH = 1.4
+DATA = "shapes+assemblies+rooms"
+PAIRS, STEPS = 30_000, 10_000
 SHARD_PAIRS = 100
 RIGHT = 0.15  # mean distance that a right transform's points have from their true place
 BATCH_PAIRS = 8
@@ -62,15 +66,16 @@ class CandidateSet(NamedTuple):
 
 def train_verification(
     runs: Path = Path("runs"),
-    data: str = "shapes+assemblies+rooms",
-    pairs: int = 30000,
-    steps: int = 10000,
+    data: str = DATA,
+    pairs: int = PAIRS,
+    steps: int = STEPS,
     seed: int = 1,
     workers: int = 2,
 ) -> None:
     """Train the network that verifies the candidates of `corrmat register`, and ship it.
 
-    The same command again goes on where it stopped. The confidence is fitted anew at the end.
+    The same command again goes on where it stopped. Only the whole training, of the default data,
+    pairs and steps, ships; the confidence is fitted anew then.
 
     Args:
         runs: folder of candidates and checkpoints.
@@ -93,7 +98,11 @@ def train_verification(
         written = (pool.map if workers else map)(write, missing.values(), missing)
         for _ in track(written, "candidates", len(missing)):
             pass
-    sets = [CandidateSet(*content) for path in shards.values() for content in torch.load(path)]
+    sets = [
+        CandidateSet(*content)
+        for path in shards.values()
+        for content in torch.load(path, mmap=True)
+    ]
     useful = [each for each in sets if 0 < each.right.sum() < len(each.right)]
     print(f"{len(useful):,} of {len(sets):,} pairs have right and wrong candidates")
     L.seed_everything(seed, verbose=False)
@@ -116,6 +125,9 @@ def train_verification(
     )  # fmt: skip
     last = checkpoints / "last.ckpt"
     trainer.fit(module, loader, ckpt_path=last if last.is_file() else None)
+    if (data, pairs, steps) != (DATA, PAIRS, STEPS):
+        print(f"{last}: a trial; only the default data, pairs and steps ship")
+        return
     path = weights.ship_network(
         "verification", "verification", {}, module.network,
         verifies=verified, pairs=str(len(useful)), seed=str(seed), commit=str(today),
@@ -138,8 +150,9 @@ def write_shard(path: Path, number: int, *, data: str, seed: int, count: int) ->
         pair = dataset[number * SHARD_PAIRS + index, int(rng.integers(len(clouds)))]
         sets.append(tuple(candidate_set(pair, generate)))
     path.parent.mkdir(parents=True, exist_ok=True)
-    torch.save(sets, path.with_suffix(".part"))
-    path.with_suffix(".part").rename(path)
+    content = io.BytesIO()
+    torch.save(sets, content)
+    replace_bytes(path, content.getbuffer())
 
 
 def candidate_set(pairs: PairBatch, generate: NetworkHypotheses) -> CandidateSet:

@@ -10,6 +10,7 @@ from corrmat.training import loggers, recipe
 from corrmat.training.console import print_messages
 from corrmat.training.experiment import train_or_reuse
 from corrmat.training.fit import silence_libraries
+from corrmat.training.hardware import flush_denormals
 from corrmat.training.preflight import prepare
 
 log = logging.getLogger("corrmat")
@@ -85,5 +86,6 @@ def train_one(
     """Train one arm in the process of a Ray worker."""
     print_messages(0)
     silence_libraries()
+    flush_denormals()
     experiment = recipe.load(config, scale, overrides, [arm])
     train_or_reuse(experiment, prepare(experiment.arms[arm]), runs_folder, logger, fresh=fresh)

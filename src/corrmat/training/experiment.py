@@ -57,6 +57,13 @@ def run(
     """
     for folder in (results, runs_folder):
         ensure_writable(folder / recipe.place)
+    with runs.only_process(runs_folder / recipe.place):  # to the end: the record is of these runs
+        return _run(recipe, results, runs_folder, logger, fresh=fresh)
+
+
+def _run(
+    recipe: Recipe, results: Path, runs_folder: Path, logger: loggers.Choice, *, fresh: bool
+) -> Record | None:
     run_at = commit()
     arms = [prepare(settings) for settings in recipe.arms.values()]
     digest = _check_test_pairs(recipe, arms)
@@ -77,7 +84,7 @@ def run(
             if not is_first_process():  # further processes only train
                 continue
             method = load_trained(arm, trained[arm.name].checkpoint)
-            tests, arm_results[arm.name] = _test(method, arm, recipe, trained[arm.name])
+            tests, arm_results[arm.name] = evaluate(method, arm, recipe, trained[arm.name])
             rows += pair_rows(arm.name, tests)
             if arm.name == recipe.treatment:
                 snapshots = _snapshots(method, arm, tests, recipe)
@@ -88,7 +95,7 @@ def run(
         if not is_available(name):
             log.info(f"the baseline {name} is left out: pip install {' '.join(OPTIONAL[name])}")
             continue
-        tests, baseline_results[name] = _test(_baseline(name, treatment), treatment, recipe)
+        tests, baseline_results[name] = evaluate(_baseline(name, treatment), treatment, recipe)
         rows += pair_rows(name, tests)
     record = Record(
         id=recipe.id,
@@ -148,18 +155,6 @@ def _time_to_train(arm: Arm) -> str:
     return f"about {max(seconds / 60, 0.1):.2g} min of training on this machine"
 
 
-def bands(edges_deg: Sequence[float]) -> list[dict[str, float]]:
-    """Return how the test pairs of each rotation band differ from those of training.
-
-    Between two edges the angles lie, and there is no translation (tables 1 and 2 of the paper).
-    Without edges there is one set of pairs, as in training.
-    """
-    return [
-        {"min_rotation_deg": low, "rotation_deg": high, "translation": 0.0}
-        for low, high in zip(edges_deg, edges_deg[1:], strict=False)
-    ] or [{}]
-
-
 def _check_test_pairs(recipe: Recipe, arms: Sequence[Arm]) -> str:
     """Compute the digest of the test pairs, and warn if the recipe expects another.
 
@@ -175,7 +170,7 @@ def _check_test_pairs(recipe: Recipe, arms: Sequence[Arm]) -> str:
             )
     for share in recipe.sweep_outliers:
         replace(first.pairs, outliers=share)  # which checks it
-    digest = first.test_pairs_digest(bands(recipe.bands_deg))
+    digest = first.test_pairs_digest(recipe.test_changes)
     if recipe.test_pairs in (None, digest):
         return digest
     message = "the test pairs made here (%s) are not the recipe's (%s): numbers compare with other "
@@ -184,7 +179,7 @@ def _check_test_pairs(recipe: Recipe, arms: Sequence[Arm]) -> str:
     return digest
 
 
-def _test(
+def evaluate(
     module: RegistrationModule, arm: Arm, recipe: Recipe, trained: TrainedArm | None = None
 ) -> tuple[Tests, ArmResult]:
     """Test a module on everything that a recipe asks for.
@@ -192,7 +187,7 @@ def _test(
     Returns:
         Per-pair values, one set a rotation band; and the result for the record.
     """
-    tests = score(module, arm, bands(recipe.bands_deg))
+    tests = score(module, arm, recipe.test_changes)
     shares = recipe.sweep_outliers
     sweep = score(module, arm, [{"outliers": share} for share in shares]) if shares else []
     together = {key: torch.cat([values[key] for values in tests]) for key in tests[0]}
@@ -232,7 +227,7 @@ def _snapshots(
     snapshots = []
     for rank, position in (("easiest", 0), ("median", len(order) // 2), ("hardest", -1)):
         band, index = divmod(order[position], per_band)
-        dataset = arm.datamodule.test_dataloader(**bands(recipe.bands_deg)[band]).dataset
+        dataset = arm.datamodule.test_dataloader(**recipe.test_changes[band]).dataset
         assert isinstance(dataset, PairDataset)
         pair = dataset[(0, index)]
         prediction = module(pair.source, pair.target)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from corrmat.data.datamodule import PairDataset
-from corrmat.errors import CorrmatError, DivergedError, short_message
+from corrmat.errors import CorrmatError, DivergedError, cannot_write, short_message
 from corrmat.methods import Method
 from corrmat.module import RegistrationModule
 from corrmat.revision import commit
@@ -28,7 +28,6 @@ from corrmat.training.console import Board, BoardProgress
 from corrmat.training.hardware import (
     describe_hardware,
     first_device,
-    flush_denormals,
     is_first_process,
     keep_freed_memory,
     on_gpu,
@@ -103,11 +102,10 @@ def train(
     if resume_from is not None:
         log.info(f"continuing from {resume_from}")
     try:
-        with flush_denormals():
-            trainer.fit(method, arm.datamodule, ckpt_path=resume_from, weights_only=True)
-    except BrokenPipeError:  # whoever read our output has gone
-        raise
+        trainer.fit(method, arm.datamodule, ckpt_path=resume_from, weights_only=True)
     except (CorrmatError, OSError) as error:
+        if isinstance(error, OSError) and not cannot_write(error):
+            raise
         last = folder / "last.ckpt"
         kept = last if last.is_file() else "none yet"
         kind = DivergedError if isinstance(error, DivergedError) else CorrmatError

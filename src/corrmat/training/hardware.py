@@ -2,7 +2,6 @@
 
 import contextlib
 import ctypes
-from collections.abc import Iterator
 
 import torch
 from lightning.pytorch.plugins.precision import MixedPrecision, Precision
@@ -110,17 +109,13 @@ def keep_freed_memory() -> None:
         library.mallopt(_M_TRIM_THRESHOLD, -1)  # never
 
 
-@contextlib.contextmanager
-def flush_denormals() -> Iterator[None]:
+def flush_denormals() -> None:
     """Let numbers below 1e-38 be zero: many CPUs compute far slower with them.
 
-    DCP's attention makes them where it is sharp.
+    DCP's attention makes them where it is sharp. Torch's threads take this over from the one that
+    starts them, so it comes before the first operation that needs them, and is for good.
     """
     torch.set_flush_denormal(True)
-    try:
-        yield
-    finally:
-        torch.set_flush_denormal(False)
 
 
 def is_first_process() -> bool:
@@ -129,21 +124,7 @@ def is_first_process() -> bool:
 
 
 def first_device(devices: Devices) -> int | list[int]:
-    """Return one device: the first of those that settings name, or any."""
-    named = _parse_devices(devices)
-    return named[:1] if isinstance(named, list) else 1
-
-
-def count_devices(devices: Devices) -> int:
-    """Count the devices that settings ask for; 0 if Lightning chooses."""
-    named = _parse_devices(devices)
-    if isinstance(named, list):
-        return len(named)
-    return max(0, int(named)) if str(named).lstrip("-").isdigit() else 0
-
-
-def _parse_devices(devices: Devices) -> Devices:
-    """Read devices as Lightning does: "2,3" names two, as a list does."""
+    """Return one device: the first of those that settings name, as a list or as "2,3", or any."""
     if isinstance(devices, str) and "," in devices:
-        return [int(name) for name in devices.split(",") if name.strip()]
-    return devices
+        return [int(devices.partition(",")[0])]
+    return devices[:1] if isinstance(devices, list) else 1

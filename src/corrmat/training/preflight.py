@@ -11,7 +11,7 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 from corrmat.data.datamodule import PairDataset, RegistrationDataModule
 from corrmat.errors import CorrmatError
 from corrmat.methods import METHODS, Method
-from corrmat.training.hardware import count_devices, trainer_options
+from corrmat.training.hardware import trainer_options
 from corrmat.training.recipe import ArmSettings
 from corrmat.types import Prediction, fewest_points
 
@@ -30,6 +30,7 @@ class Arm:
     name: str
     settings: ArmSettings
     datamodule: RegistrationDataModule
+    processes: int  # that train together
 
 
 def prepare(settings: ArmSettings) -> Arm:
@@ -42,8 +43,15 @@ def prepare(settings: ArmSettings) -> Arm:
     if not 0 <= settings.seed < 2**32:
         raise CorrmatError(f"seed {settings.seed} is not between 0 and 2^32")
     method = build_method(settings)
+    try:
+        trainer = L.Trainer(**trainer_options(settings), logger=False)  # pyright: ignore[reportArgumentType]
+    except (MisconfigurationException, ValueError, TypeError) as error:
+        reason = str(error).splitlines()[0]
+        raise CorrmatError(
+            f"cannot build a Trainer from the --trainer options: {reason}"
+        ) from error
     datamodule = RegistrationDataModule(**settings.data.as_dict(), seed=settings.seed)
-    arm = Arm(settings.name, settings, datamodule)
+    arm = Arm(settings.name, settings, datamodule, trainer.world_size)
     required, points = fewest_points(method.network), datamodule.pairs.num_source
     if points < required:
         raise CorrmatError(
@@ -55,13 +63,6 @@ def prepare(settings: ArmSettings) -> Arm:
     _check_optimization(arm)
     _check_validation(arm)
     _try_one_batch(method, arm)
-    try:
-        L.Trainer(**trainer_options(settings), logger=False)  # pyright: ignore[reportArgumentType]
-    except (MisconfigurationException, ValueError, TypeError) as error:
-        reason = str(error).splitlines()[0]
-        raise CorrmatError(
-            f"cannot build a Trainer from the --trainer options: {reason}"
-        ) from error
     return arm
 
 
@@ -94,7 +95,7 @@ def planned_steps(arm: Arm) -> int | None:
 
 def _train_batches(arm: Arm) -> int:
     """Count the batches of an epoch in each process."""
-    return arm.datamodule.count_train_batches(_processes(arm))
+    return arm.datamodule.count_train_batches(arm.processes)
 
 
 def _limited(batches: int, limit: float | None) -> int:
@@ -104,17 +105,12 @@ def _limited(batches: int, limit: float | None) -> int:
     return min(batches, limit) if isinstance(limit, int) else int(batches * limit)
 
 
-def _processes(arm: Arm) -> int:
-    trainer = arm.settings.trainer
-    return max(1, count_devices(trainer.devices)) * trainer.num_nodes  # 0: Lightning counts them
-
-
 def _check_processes(arm: Arm) -> None:
     """Reject more processes than there are shapes for each to validate on."""
-    processes, held_out = _processes(arm), len(arm.datamodule.clouds("val"))
-    if processes > held_out:
+    held_out = len(arm.datamodule.clouds("val"))
+    if arm.processes > held_out:
         raise CorrmatError(
-            f"{processes} processes cannot share {held_out} held-out shapes: lower "
+            f"{arm.processes} processes cannot share {held_out} held-out shapes: lower "
             "--trainer.devices, or raise --data.train_shapes"
         )
 
@@ -143,6 +139,10 @@ def _check_optimization(arm: Arm) -> None:
             raise CorrmatError(f"--trainer.{name} {getattr(trainer, name):g} leaves nothing to do")
     timed = trainer.max_time is not None and trainer.max_epochs is None
     endless = trainer.max_steps == -1 and (trainer.max_epochs == -1 or timed)
+    if endless and optimizer.freeze_norms < 1:
+        raise CorrmatError(
+            "--optimizer.freeze_norms, a share of the run, needs --trainer.max_steps or max_epochs"
+        )
     if optimizer.schedule == "onecycle":
         if endless:
             raise CorrmatError("a one-cycle learning rate needs --trainer.max_steps or max_epochs")

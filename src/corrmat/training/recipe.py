@@ -97,6 +97,18 @@ class Recipe:
         return next(iter(self.arms.values())).data_name
 
     @property
+    def test_changes(self) -> list[dict[str, float]]:
+        """How the test pairs of each rotation band differ from those of training.
+
+        Between two edges the angles lie, and there is no translation (tables 1 and 2 of the paper).
+        Without bands there is one set of pairs, as in training.
+        """
+        return [
+            {"min_rotation_deg": low, "rotation_deg": high, "translation": 0.0}
+            for low, high in zip(self.bands_deg, self.bands_deg[1:], strict=False)
+        ] or [{}]
+
+    @property
     def place(self) -> Path:
         """Folder of the record below results/, and of the runs below runs/."""
         return self.place_of(self.id)

@@ -27,6 +27,10 @@ log = logging.getLogger("corrmat")
 _TRAINED = "trained.json"
 _SETTINGS = "settings.yaml"
 _COMMITS = "commits.txt"  # of the code, one for each time that the run was started or resumed
+_UNIMPORTANT = {
+    "data": ("root", "name", "num_workers", "test_shapes"),
+    "trainer": ("enable_progress_bar", "log_every_n_steps"),
+}
 _RECORDED = "recorded"  # marks an arm whose record is written: the next run trains anew
 
 
@@ -71,8 +75,8 @@ def only_process(folder: Path) -> Iterator[None]:
 def training_settings(arm: Arm) -> str:
     """Return what decides how an arm is trained, as YAML.
 
-    Settings, and checksums of the shapes and of the weights that it starts from. The data's
-    folder, the number of workers and the number of test shapes do not count.
+    Settings, and checksums of the shapes and of the weights that it starts from. What only says
+    where the data lies, and what is shown meanwhile, does not count.
     """
     settings = _that_count(arm.settings.as_plain())
     checksums: Settings = {"data": {"checksum": arm.datamodule.clouds("train").checksum()}}
@@ -82,11 +86,12 @@ def training_settings(arm: Arm) -> str:
 
 
 def _that_count(settings: Settings) -> Settings:
-    """Leave out the settings of the data that do not decide how an arm is trained."""
-    data = cast(Settings, settings["data"])
-    unimportant = ("root", "name", "num_workers", "test_shapes")
-    kept = {name: value for name, value in data.items() if name not in unimportant}
-    return settings | {"data": kept}
+    """Leave out the settings that do not decide how an arm is trained."""
+    kept: Settings = {}
+    for group, unimportant in _UNIMPORTANT.items():
+        values = cast(Settings, settings[group])
+        kept[group] = {name: value for name, value in values.items() if name not in unimportant}
+    return settings | kept
 
 
 def set_aside(folder: Path, arm: Arm) -> None:
@@ -213,6 +218,6 @@ def _same_settings(folder: Path, arm: Arm) -> bool:
     stored = folder / _SETTINGS
     if not stored.is_file():
         return False
-    defaults = _that_count(default_settings(arm.settings.method))
-    then = merge(defaults, yaml.safe_load(stored.read_text()))
+    defaults = default_settings(arm.settings.method)
+    then = _that_count(merge(defaults, yaml.safe_load(stored.read_text())))
     return then == yaml.safe_load(training_settings(arm))
