@@ -806,6 +806,30 @@ def test_half_a_turn_of_the_best_candidate_is_a_candidate_too():
         assert len(choice.find_candidates(mistaken, clouds, half_turns=False)[0]) == 1
 
 
+def profile(rng, low, high, count):
+    """Points of an L, extruded along z, with the noise of a scanner."""
+    u = rng.uniform(-2, 1.5, count)
+    points = np.stack([np.maximum(u, 0), np.maximum(-u, 0), rng.uniform(low, high, count)], 1)
+    return points + rng.normal(0, 0.004, (count, 3))
+
+
+@pytest.mark.parametrize("count", [1000, 3000])
+def test_a_profile_that_may_slide_along_itself_is_doubtful(count):
+    """Two thirds overlap; all of it agrees after a shift by the last third, too."""
+    rng = np.random.default_rng(0)
+    rotation = Rotation.from_rotvec([0.3, -0.5, 1.0]).as_matrix()
+    source, target = profile(rng, 0, 3, count), profile(rng, 1, 4, count)
+    result = corrmat.register(source, target @ rotation.T + 1.0)
+    axis = rotation[:, 2] * np.sign(rotation[np.abs(rotation[:, 2]).argmax(), 2])
+    np.testing.assert_allclose(result.slides_along, axis, atol=0.1)
+    assert result.verdict.startswith("doubtful: ")
+    assert "sliding along (" in result.verdict
+    ended = [np.hstack([rng.uniform(0, 1, (count // 3, 2)), np.full((count // 3, 1), 3.0)])]
+    held = corrmat.register(np.vstack([source, *ended]), np.vstack([source, *ended]) @ rotation.T)
+    assert held.slides_along is None
+    assert held.verdict == "aligned"
+
+
 def test_a_fragment_of_a_room_that_lies_right_stays_there():
     """EM-ICP alone slides it along its walls."""
     room = make_room_pair(12, 20_000, "val")

@@ -27,7 +27,8 @@ from corrmat.weights import load_model
 
 Refine = Literal["icp", "none"]
 FEW_POINTS = 30  # unrelated clouds of fewer points may lie on each other
-DOUBTFUL = 0.49  # confidence, at most, of so few points, and where no match agrees
+FEW_AGREE = 0.02  # share of the matches: fewer that agree are chance
+DOUBTFUL = 0.49  # confidence, at most, where one of these holds, or the source may slide
 OTHER_SIZE = 8.0  # times as large: two such clouds may have different units
 
 
@@ -98,9 +99,12 @@ def register(
     confidence = _calibration().confidence(agreement, support if len(agrees) else None, *of_large)
     x, y = clouds.source, clouds.target
     fewest = min(len(x.rows), len(y.rows))
-    if fewest < FEW_POINTS or (len(agrees) and not agrees.any()):
+    full = clouds.scorers[-1]
+    overlap, rmse = full.overlap_and_rmse(transform)
+    slides_along = full.sliding_direction(transform)
+    few_agree = len(agrees) > 0 and agrees.mean() < FEW_AGREE
+    if fewest < FEW_POINTS or few_agree or slides_along is not None:
         confidence = min(confidence, DOUBTFUL)
-    overlap, rmse = clouds.scorers[-1].overlap_and_rmse(transform)
     rows = [cloud.rows[m] for cloud, m in zip((x, y), hypotheses.matches.T, strict=True)]
     return Registration(
         transform=clouds.to_original_units(transform),
@@ -115,24 +119,33 @@ def register(
         calibrated=hypotheses.verification is not None and refine == "icp",
         rmse=rmse / clouds.scale,
         overlap=overlap,
-        verdict=verdict(confidence, _reason(agrees, overlap, x.median / y.median, fewest)),
+        slides_along=slides_along,
+        verdict=verdict(
+            confidence, _reason(agrees, overlap, slides_along, x.median / y.median, fewest)
+        ),
         model=str(model),
         seed=seed,
         seconds=time.perf_counter() - start,
     )
 
 
-def _reason(agrees: np.ndarray, overlap: float, size: float, fewest: int) -> str:
+def _reason(
+    agrees: np.ndarray, overlap: float, slides_along: np.ndarray | None, size: float, fewest: int
+) -> str:
     """Say what a confidence that is not high rests on.
 
     Args:
         agrees: (K,) bool, whether the transform explains each match.
         overlap: share of the source that lies on the target.
+        slides_along: (3,), the direction in which the target does not hold the source.
         size: of the source, relative to the target.
         fewest: points of the smaller cloud.
     """
     reasons = [f"{agrees.sum()} of {len(agrees)} matches agree"] if len(agrees) else []
     reasons.append(f"{overlap:.0%} of the source lies on the target")
+    if slides_along is not None:
+        x, y, z = slides_along.round(2) + 0.0
+        reasons.append(f"the aligned surfaces do not keep it from sliding along ({x}, {y}, {z})")
     if fewest < FEW_POINTS:
         reasons.append(f"a cloud has only {fewest} points")
     if max(size, 1 / size) > OTHER_SIZE:

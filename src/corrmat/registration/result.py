@@ -24,6 +24,7 @@ class Registration:
     calibrated: bool  # whether it was fitted to this model and refinement: shipped weights and ICP
     rmse: float  # of aligned source points near a target point, in the clouds' units
     overlap: float  # share of source points near a target point: twice the spacing of points
+    slides_along: np.ndarray | None  # (3,) in the target's axes: where its surfaces do not hold it
     verdict: str  # "aligned", or "probably aligned: " or "doubtful: " and why
     model: str
     seed: int
@@ -82,6 +83,8 @@ def to_json(registration: Registration, source: str, target: str) -> str:
     values = {name: getattr(registration, name) for name in names}
     if not np.isfinite(registration.rmse):
         values["rmse"] = None
+    slides = registration.slides_along
+    values["slides_along"] = None if slides is None else slides.tolist()
     files = {"source": source, "target": target}
     content = {**files, "transform": registration.transform.tolist(), **values}
     return json.dumps(content, indent=1) + "\n"
