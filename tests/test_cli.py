@@ -1,5 +1,7 @@
+import json
 import subprocess
 import sys
+from pathlib import Path
 from typing import get_args
 
 import numpy as np
@@ -331,6 +333,31 @@ def test_evaluate_tests_on_all_that_the_record_has(capsys):
         tables = len([line for line in shown if line.endswith((" deg", " outliers"))])
         tables += experiment == "outliers"  # the recipe's own share comes first
         assert sum(line.startswith("rotation_error_deg_median") for line in shown) == tables == 6
+
+
+def test_a_guess_comes_from_a_file_as_json_wrote_it_or_as_numbers(tmp_path, capsys):
+    folder = str(tmp_path / "scans")
+    assert main(["example", folder]) == 0
+    scans = f"{folder}/source.ply", f"{folder}/target.ply"
+    words = ["register", *scans, "--model", "icp", "--json", str(tmp_path / "T.json")]
+    assert main([*words, "--init", f"{folder}/truth.json"]) == 0
+    truth = np.array(json.loads(Path(folder, "truth.json").read_text())["transform"])
+    found = json.loads((tmp_path / "T.json").read_text())["transform"]
+    np.testing.assert_allclose(np.array(found)[:3, :3], truth[:3, :3], atol=0.01)
+    np.testing.assert_allclose(np.array(found)[:3, 3], truth[:3, 3], atol=5)  # mm
+    numbers = tmp_path / "T.txt"
+    np.savetxt(numbers, truth)
+    assert main([*words, "--init", str(numbers)]) == 0
+    assert json.loads((tmp_path / "T.json").read_text())["transform"] == found
+    capsys.readouterr()
+    for content, message in (("1 2 3", "no matrix of 4 x 4"), ("a b", "holds no matrix")):
+        numbers.write_text(content)
+        assert main([*words, "--init", str(numbers)]) == 2
+        assert message in capsys.readouterr().err
+    assert main([*words[:2], *scans, "--init", str(numbers)]) == 2
+    assert "there are several" in capsys.readouterr().err
+    assert main([*words, "--init", "none.txt"]) == 2
+    assert "none.txt: no such file" in capsys.readouterr().err
 
 
 def test_a_page_is_not_written_to_standard_output(tmp_path, monkeypatch, capsys):

@@ -806,6 +806,43 @@ def test_half_a_turn_of_the_best_candidate_is_a_candidate_too():
         assert len(choice.find_candidates(mistaken, clouds, half_turns=False)[0]) == 1
 
 
+def test_a_guess_is_one_more_candidate(pair):
+    """ICP alone starts from the identity, which is too far; from the guess it arrives."""
+    _, source, target, truth = pair
+    size = np.ptp(source[:, :3], axis=0).max()
+
+    def error(transform):
+        offsets = source[:, :3] @ (transform - truth)[:3, :3].T + (transform - truth)[:3, 3]
+        return np.linalg.norm(offsets, axis=1).mean() / size
+
+    def about_centroid(rotvec):
+        rotation, centre = Rotation.from_rotvec(rotvec).as_matrix(), source[:, :3].mean(0)
+        return truth @ rigid.to_homogeneous(rotation, centre - rotation @ centre)
+
+    guess, wrong = about_centroid([0.1, -0.1, 0.1]), about_centroid([2.0, 1.0, 0.0])
+    alone = corrmat.register(source, target, model="icp").transform
+    guided = corrmat.register(source, target, model="icp", init=guess).transform
+    assert error(guided) < 0.02 < error(guess) < error(alone)
+    misled = corrmat.register(source, target, init=wrong).transform
+    assert error(misled) < 0.02, "a wrong guess does not win"
+
+
+@pytest.mark.parametrize(
+    ("init", "message"),
+    [
+        (np.eye(3), r"but \(3, 3\)"),
+        (np.diag([1.0, 1, -1, 1]), "scales, shears or mirrors"),
+        (np.diag([2.0, 2, 2, 1]), "scales, shears or mirrors"),
+        (np.full((4, 4), np.nan), "finite"),
+        ("a.txt", "init is no matrix"),
+    ],
+)
+def test_a_guess_that_is_not_rigid_is_refused(init, message):
+    cloud = np.random.default_rng(0).normal(size=(50, 3))
+    with pytest.raises(CorrmatError, match=message):
+        corrmat.register(cloud, cloud, init=init)
+
+
 def profile(rng, low, high, count):
     """Points of an L, extruded along z, with the noise of a scanner."""
     u = rng.uniform(-2, 1.5, count)

@@ -27,6 +27,8 @@ def write(path, points=POINTS):
         PointCloud.from_xyz_points(points.astype(np.float32)).save(path)
     elif kind == ".npy":
         np.save(path, points)
+    elif kind == ".bin":
+        np.pad(points, ((0, 0), (0, 1))).astype(np.float32).tofile(path)
     elif kind == ".npz":
         np.savez(path, cloud=points, label=np.arange(3))
     else:
@@ -40,7 +42,7 @@ def write(path, points=POINTS):
 def test_every_cloud_format_gives_its_points(tmp_path, kind):
     scan = read_scan(write(tmp_path / f"cloud{kind}"))
     assert scan.dtype == np.float64
-    assert np.abs(scan - POINTS).max() < (1e-4 if kind == ".pcd" else 1e-12)
+    assert np.abs(scan - POINTS).max() < (1e-4 if kind in (".pcd", ".bin") else 1e-12)
 
 
 @pytest.mark.parametrize("kind", MESHES)
@@ -63,6 +65,24 @@ def test_parts_of_a_scene_are_merged(tmp_path):
     trimesh.Scene(boxes).export(tmp_path / "scene.glb")
     scan = read_scan(tmp_path / "scene.glb")
     assert abs((scan[:, 0] > 5).mean() - 0.5) < 0.02
+
+
+def test_an_xyz_file_may_name_elements_below_a_comment(tmp_path):
+    (tmp_path / "a.xyz").write_text("2\nwater, in 1e-10 m\nO 0 1 2\nH 3 4 5 0.1\n")
+    np.testing.assert_array_equal(read_scan(tmp_path / "a.xyz"), [[0, 1, 2], [3, 4, 5]])
+    (tmp_path / "b.xyz").write_text("2\n\nO 0 1 2\nH 3 4 5\n")
+    np.testing.assert_array_equal(read_scan(tmp_path / "b.xyz"), [[0, 1, 2], [3, 4, 5]])
+    (tmp_path / "c.xyz").write_text("2\nz y x\n0 1 2\n3 4 5\n")
+    np.testing.assert_array_equal(read_scan(tmp_path / "c.xyz"), [[2, 1, 0], [5, 4, 3]])
+
+
+def test_a_sweep_of_kitti_is_read(tmp_path):
+    rows = np.arange(12, dtype=np.float32).reshape(3, 4)
+    (tmp_path / "0.bin").write_bytes(rows.tobytes())
+    np.testing.assert_array_equal(read_scan(tmp_path / "0.bin"), rows[:, :3])
+    (tmp_path / "0.bin").write_bytes(rows.tobytes()[:-4])
+    with pytest.raises(CorrmatError, match="rows of four float32"):
+        read_scan(tmp_path / "0.bin")
 
 
 def test_an_xyz_file_may_begin_with_its_count_and_carry_more_columns(tmp_path):

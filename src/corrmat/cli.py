@@ -162,6 +162,7 @@ def _compare(options: Namespace) -> int:
     """Compare models on the frozen pairs of a protocol."""
     from corrmat.files import ensure_writable
     from corrmat.registration import benchmark
+    from corrmat.registration.register import hypothesis_generator
     from corrmat.reporting.model_results import write_comparison
     from corrmat.revision import commit
 
@@ -182,6 +183,8 @@ def _compare(options: Namespace) -> int:
             )
         about["data"] = "procedural"
     code = commit() if options.record is not None else None
+    for model in models:
+        hypothesis_generator(model)  # an unknown one is said before shapes are made
     pairs = benchmark.frozen_pairs(**about, root=options.root, count=options.pairs)
     results = benchmark.compare(pairs, models)
     fewer = f", one of each shape: {options.pairs} were asked for"
@@ -196,6 +199,12 @@ def _compare(options: Namespace) -> int:
 def _register(options: Namespace) -> int:
     """Register one file, or several, onto another."""
     from corrmat.files import ensure_writable
+
+    if options.init is not None:
+        if len(options.source) > 1:
+            raise CorrmatError("--init is a guess for one source; there are several")
+        if not options.init.is_file():
+            raise CorrmatError(f"{options.init}: no such file")
 
     json_file = None if options.json == _STDOUT else options.json
     files = [*filter(None, (json_file, options.html, options.gif)), *_moved_files(options)]
@@ -263,9 +272,12 @@ def _register_pair(options: Namespace) -> str:
     names = str(options.source[0]), str(options.target)
     (source, target), clouds = _read_scans(options)
     from corrmat.registration.register import register
-    from corrmat.registration.result import to_json, to_text
+    from corrmat.registration.result import read_transform, to_json, to_text
 
-    registration = register(*clouds, model=options.model, refine=options.refine, seed=options.seed)
+    registration = register(
+        *clouds, model=options.model, refine=options.refine, seed=options.seed,
+        init=None if options.init is None else read_transform(options.init),
+    )  # fmt: skip
     print(to_text(registration))
     if options.output is not None:
         write_moved(options.output, options.source[0], registration.transform)

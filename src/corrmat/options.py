@@ -68,6 +68,9 @@ COMPARE_EPILOG = """examples:
   corrmat compare corrmat,ransac,fgr,icp --protocol real
   corrmat compare corrmat,dcp_v1.t7 --data modelnet40 --root /data --points 1024
 
+What is compared is all of `corrmat register`: the matches of every model, 1.2/DCP too, go
+through candidates, choice and ICP. How good a network alone is, corrmat evaluate says.
+
 protocols:
   real    two scans of one shape: no shared point, noise, outliers, normals estimated, and
           each cloud without 30 % of its points
@@ -87,12 +90,14 @@ REGISTER_EPILOG = """examples:
       write the moved source, the result for programs, and a page to look at
   corrmat register front.ply left.ply back.ply -o moved/
       every scan onto the last: all pairs are registered, and the poses that most agree on win
+  corrmat register a.npy b.npy --init odometry.txt
+      one scan is nearly in place: the guess is one more candidate
   corrmat register a.npy b.npy --model ransac
       the classical pipeline instead (pip install -e '.[baselines]' in corrmat's folder)
 
 Files: PLY, OBJ, STL, OFF, GLB, GLTF (meshes are sampled, scenes merged), PCD, XYZ, TXT, CSV,
-ASC, PTS, NPY, NPZ. Both files must have the same unit, whichever it is. Parts may be missing
-from either.
+ASC, PTS, NPY, NPZ, BIN (as KITTI's). Both files must have the same unit, whichever it is.
+Parts may be missing from either.
 
 verdict: "aligned" from a confidence of 94 % on, "probably aligned" from 50 %, else "doubtful".
 It was fitted on simulated pairs of objects and rooms: look at --html before you rely on it.
@@ -342,6 +347,10 @@ def _add_register_options(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--refine", type=Literal["icp", "none"], default="icp",
         help=f"refinement after the model {DEFAULT}",
+    )  # fmt: skip
+    parser.add_argument(
+        "--init", type=Path, metavar="MATRIX",
+        help="a first guess, one more candidate: 4 lines of 4 numbers, or what --json wrote",
     )  # fmt: skip
     parser.add_argument("--seed", type=_count, default=0, help=SEED_HELP)
 

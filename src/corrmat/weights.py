@@ -334,9 +334,11 @@ def checkpoint_network(path: Path) -> tuple[str, dict[str, Any], nn.Module]:
     classes = {method.__name__: method for method in METHODS.values()}
     method = cast("str", content.get("method"))
     if method not in classes:
-        reason = f"it is of method {method!r}" if method else "it names no method"
+        if not method:
+            raise CorrmatError(f"{path} is no checkpoint of corrmat fit: it names no method")
         raise CorrmatError(
-            f"{path} is no checkpoint of corrmat fit: {reason}; methods: {', '.join(classes)}"
+            f"{path} is of method {method!r}, which is not corrmat's own ({', '.join(classes)}); "
+            "run the same words through the file that defines it: python mine.py register ..."
         )
     try:
         hparams = content["hyper_parameters"]["network"]

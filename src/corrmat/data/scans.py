@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import trimesh
 
 MESHES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
-CLOUDS = (".pcd", ".xyz", ".txt", ".csv", ".asc", ".pts", ".npy", ".npz")
+CLOUDS = (".pcd", ".xyz", ".txt", ".csv", ".asc", ".pts", ".npy", ".npz", ".bin")
 SAMPLES = 20_000  # points taken of a mesh's surface
 _POINTS = ("points", "xyz", "pos")  # usual names of an array of points beside others
 _XYZ = {"x", "y", "z"}
@@ -35,7 +35,7 @@ def read_scan(path: str | Path, seed: int = 0) -> np.ndarray:
     See `read_shape`.
 
     Args:
-        path: PLY, OBJ, STL, OFF, GLB or GLTF; PCD, XYZ, TXT, CSV, ASC, PTS, NPY or NPZ.
+        path: PLY, OBJ, STL, OFF, GLB or GLTF; PCD, XYZ, TXT, CSV, ASC, PTS, NPY, NPZ or BIN.
         seed: of the sampling of a mesh.
 
     Raises:
@@ -73,7 +73,8 @@ def read_shape(path: Path) -> "np.ndarray | trimesh.Trimesh":
         )
     if not path.stat().st_size:
         raise CorrmatError(f"{path} is empty")
-    reader = {".ply": _ply, ".pcd": _pcd, ".npy": _numpy, ".npz": _numpy}.get(kind)
+    readers = {".ply": _ply, ".pcd": _pcd, ".npy": _numpy, ".npz": _numpy, ".bin": _kitti}
+    reader = readers.get(kind)
     reader = reader or (_scene if kind in MESHES else _text)
     try:
         points = reader(path)
@@ -284,10 +285,18 @@ def _numpy(path: Path) -> np.ndarray:
         return content[names[0]]
 
 
+def _kitti(path: Path) -> np.ndarray:
+    """Read a sweep as the KITTI data set has it: float32 rows of x, y, z and reflectance."""
+    if path.stat().st_size % 16:
+        raise CorrmatError(f"{path} does not hold rows of four float32 numbers, as KITTI's BIN do")
+    return np.fromfile(path, "<f4").reshape(-1, 4)
+
+
 def _text(path: Path) -> np.ndarray:
     """Read the columns x, y and z of a text file, by its header or else the first three.
 
-    A header may be a comment, as np.savetxt writes it. Other comments are skipped.
+    A header may be a comment, as np.savetxt writes it. Other comments are skipped. XYZ files of
+    chemistry have the number of rows, a line of text, and the element before the coordinates.
     """
     lines = [line.strip() for line in path.read_text("utf-8-sig", "replace").splitlines()]
     comments = [line for line in lines if line.startswith("#")]
@@ -298,11 +307,15 @@ def _text(path: Path) -> np.ndarray:
     if len(last) > 1 and all(map(_DECIMAL_COMMA, last)):
         raise CorrmatError(f"{path}: numbers like 1,5 need a decimal point")
     count = int(lines.pop(0)) if lines[0].isdigit() else 0  # of points, in PTS and XYZ files
+    if count and len(lines) == count + 1 and not _XYZ.issubset(lines[0].lower().split()):
+        del lines[0]
     sample = "".join(lines[1:2] or lines)  # a row, below the header if there is one
     separator = next((mark for mark in ";," if mark in sample), None)
     columns = [0, 1, 2]
     first = _cells(lines[0].lstrip("/ "), separator) if lines else []
-    if lines and not any(map(_is_number, first)):  # a header
+    if count and len(first) > 3 and first[0].isalpha():
+        columns = [1, 2, 3]
+    elif lines and not any(map(_is_number, first)):  # a header
         names = [word.lower() for word in first]
         if not _XYZ.issubset(names):
             raise CorrmatError(

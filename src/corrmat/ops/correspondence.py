@@ -139,7 +139,7 @@ class SoftCorrespondence:
             (B, N) negative log-likelihoods; 0 for ignored rows.
 
         Raises:
-            ValueError: an index of another shape or, on a CPU, outside -1 to M.
+            ValueError: an index of another shape, or of no integers, or, on a CPU, outside -1 to M.
         """
         self._check(index)
         total, _ = self._rows()
@@ -154,6 +154,8 @@ class SoftCorrespondence:
                 f"true matches of shape {tuple(index.shape)} for features of shape "
                 f"{tuple(self.feature_source.shape)}"
             )
+        if index.is_floating_point() or index.dtype == torch.bool:
+            raise ValueError(f"true matches are integers, not {index.dtype}")
         if index.device.type != "cpu" or not index.numel():
             return
         low, high = index.numpy().min(), index.numpy().max()

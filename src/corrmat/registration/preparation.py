@@ -13,6 +13,7 @@ MODEL_POINTS = 1024  # points of each cloud for the model
 FULL_POINTS = LEVELS[-1]  # at most, to refine the best of its hypotheses
 MEDIAN = 0.6  # median distance from the centroid after scaling: a radius of about one
 NORMAL_TOLERANCE = 0.01  # by which the length of a given normal may differ from one
+RIGID_TOLERANCE = 0.01  # by which the rotation of a given transform may differ from one
 FAR = 30.0  # median distances from the middle: a point beyond is a stray one and left out
 _LINE = 1e-6  # a cloud that is thinner, relative to its length, is a line
 
@@ -132,6 +133,26 @@ def prepare_clouds(
     return PreparedClouds(x, y, scale, subsamples, scorers)
 
 
+def as_rigid(transform: np.ndarray) -> np.ndarray:
+    """Check a rigid transform (4, 4) that somebody gives, and make its rotation exact.
+
+    Raises:
+        CorrmatError: it is none.
+    """
+    try:
+        given = np.array(transform, np.float64)
+    except (TypeError, ValueError) as error:
+        raise CorrmatError(f"init is no matrix: {error}") from error
+    if given.shape != (4, 4) or not np.isfinite(given).all():
+        raise CorrmatError(f"init is no matrix of 4 x 4 finite numbers, but {given.shape}")
+    left, stretch, right = np.linalg.svd(given[:3, :3])
+    rotates = np.abs(stretch - 1).max() < RIGID_TOLERANCE and np.linalg.det(left @ right) > 0
+    if not rotates or (given[3] != (0, 0, 0, 1)).any():
+        raise CorrmatError("init does not only rotate and shift: it scales, shears or mirrors")
+    given[:3, :3] = left @ right
+    return given
+
+
 def is_near(points: np.ndarray, different: np.ndarray, name: str = "cloud") -> np.ndarray:
     """Tell which points are no stray ones: (N,) bool.
 
@@ -141,14 +162,15 @@ def is_near(points: np.ndarray, different: np.ndarray, name: str = "cloud") -> n
         name: of the cloud, for the error.
 
     Raises:
-        CorrmatError: coordinates are too large to be squared.
+        CorrmatError: coordinates are too large, or too small, to be squared.
     """
     middle = np.median(different, axis=0)
     with np.errstate(over="ignore"):
         distance = np.linalg.norm(points - middle, axis=1)
         typical = np.median(np.linalg.norm(different - middle, axis=1))
-    if not np.isfinite(typical):
-        raise CorrmatError(f"{name}: coordinates are too large to compute distances")
+    if not 0 < typical < np.inf:
+        size = "small" if typical == 0 else "large"
+        raise CorrmatError(f"{name}: coordinates are too {size} to compute distances")
     return distance <= FAR * typical
 
 

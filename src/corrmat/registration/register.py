@@ -20,7 +20,7 @@ from corrmat.registration.choice import (
     weights_for,
 )
 from corrmat.registration.hypotheses import CLASSICAL, HypothesisGenerator, NetworkHypotheses
-from corrmat.registration.preparation import Cloud, prepare_clouds
+from corrmat.registration.preparation import Cloud, as_rigid, prepare_clouds
 from corrmat.registration.result import Registration
 from corrmat.registration.verification import verify
 from corrmat.weights import load_model
@@ -38,6 +38,7 @@ def register(
     *,
     model: str | Path | nn.Module = "corrmat",
     refine: Refine = "icp",
+    init: np.ndarray | None = None,
     seed: int = 0,
 ) -> Registration:
     """Find the rigid transform that takes the source onto the target.
@@ -55,6 +56,7 @@ def register(
         refine: "icp": generalised ICP of all candidates of the model, then EM-ICP of the best, or
             generalised ICP on more and more points where both clouds have more than 2,048; or
             "none": the candidates as they are.
+        init: (4, 4), a guess of the transform, such as an odometry's: one more candidate.
         seed: of subsampling and of the model's random draws.
 
     Returns:
@@ -62,21 +64,25 @@ def register(
 
     Raises:
         CorrmatError: the points are not a cloud, or do not determine a rotation; the model is
-            unknown.
+            unknown; the guess is not rigid.
     """
     if refine not in ("icp", "none"):
         raise CorrmatError(f"refine = {refine!r}; choices: icp, none")
     seed = operator.index(seed)  # an integer of NumPy is one too
     if not 0 <= seed < 2**63:
         raise CorrmatError(f"seed = {seed} is not between 0 and 2^63")
+    guess = None if init is None else as_rigid(init)
     if isinstance(model, nn.Module):
         generate: HypothesisGenerator = NetworkHypotheses(model)
         model = type(model).__name__
     else:
-        generate = CLASSICAL.get(str(model)) or _load_network(str(model))
+        generate = hypothesis_generator(str(model))
     start = time.perf_counter()
     clouds = prepare_clouds(source, target, seed)
     hypotheses = generate(*clouds.subsamples, seed)
+    if guess is not None:
+        transforms = hypotheses.transforms, clouds.from_original_units(guess)[None]
+        hypotheses = hypotheses._replace(transforms=np.concatenate(transforms))
 
     if refine == "icp":
         half_turns = hypotheses.verification is not None
@@ -152,6 +158,15 @@ def _reason(
         times = f"{max(size, 1 / size):,.0f} times as large"
         reasons.append(f"one cloud is {times} as the other: do both have the same unit?")
     return ", ".join(reasons)
+
+
+def hypothesis_generator(model: str) -> HypothesisGenerator:
+    """Return the classical pipeline of this name, or load a network.
+
+    Raises:
+        CorrmatError: there is no such model.
+    """
+    return CLASSICAL.get(model) or _load_network(model)
 
 
 def _load_network(model: str) -> NetworkHypotheses:

@@ -2,10 +2,12 @@
 
 import json
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from corrmat.calibration import as_percent
+from corrmat.errors import CorrmatError
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -53,7 +55,9 @@ def to_text(registration: Registration) -> str:
         f"rotation     {registration.rotation_deg:.3f} deg",
         f"translation  {x:.6g} {y:.6g} {z:.6g}",
         f"overlap      {registration.overlap:.1%} of the source has a target point near",
-        f"RMSE         {registration.rmse:.6g} of these points" if registration.overlap else "",
+        f"RMSE         {registration.rmse:.6g} between these points"
+        if registration.overlap
+        else "",
     ]
     if len(registration.matches):
         agree, matches = registration.match_agrees.sum(), len(registration.matches)
@@ -65,6 +69,21 @@ def to_text(registration: Registration) -> str:
     ]
     lines.append(f"({registration.model}, seed {registration.seed}, {registration.seconds:.2f} s)")
     return "\n".join(filter(None, lines))
+
+
+def read_transform(path: Path) -> np.ndarray:
+    """Read a matrix: "transform" of a JSON file such as --json writes, or lines of numbers.
+
+    Raises:
+        CorrmatError: the file holds none.
+    """
+    try:
+        text = path.read_text()
+        if path.suffix.lower() == ".json":
+            return np.array(json.loads(text)["transform"], np.float64)
+        return np.loadtxt(text.splitlines(), np.float64)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CorrmatError(f"{path} holds no matrix ({type(error).__name__}: {error})") from error
 
 
 def note_on_confidence(calibrated: bool) -> str:
