@@ -121,6 +121,9 @@ def _edge_mlp(
 ) -> list[Tensor]:
     """Apply layers to edges (B, P, K, I); return the maxima (B, P, O) of the last or of all.
 
+    Variances come from sums of squares, in the precision of the edges or float32. They are inexact
+    where a channel's mean is many times its deviation, which the norms of a network keep it from.
+
     Args:
         edges: of B samples.
         layers: the linear layer and the norm of each.

@@ -49,6 +49,11 @@ def to_homogeneous(rotation: ArrayLike | Tensor, translation: ArrayLike | Tensor
     return matrix
 
 
+def move(transform: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Move points (N, 3) by a transform (4, 4)."""
+    return points @ transform[:3, :3].T + transform[:3, 3]
+
+
 def axis_angle_to_matrix(axis: Tensor, angle_rad: Tensor) -> Tensor:
     """Compute rotation matrices by Rodrigues' formula.
 

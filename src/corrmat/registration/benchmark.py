@@ -15,6 +15,7 @@ from corrmat.data.registry import load_clouds
 from corrmat.data.scan_pairs import ScanPair, make_object_pair, make_room_pair
 from corrmat.errors import CorrmatError
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG, rotation_error_deg
+from corrmat.ops import rigid
 from corrmat.progress import track
 from corrmat.registration.register import register
 from corrmat.reporting.model_results import SCORES, ModelResult
@@ -214,7 +215,7 @@ def errors(pairs: PairBatch, index: int, transform: np.ndarray) -> tuple[float, 
     rotation, translation = pairs.rotation[index].double().numpy(), pairs.translation[index].numpy()
     clean = pairs.clean[index].double().numpy()
     truth = clean @ rotation.T + translation
-    moved = clean @ transform[:3, :3].T + transform[:3, 3]
+    moved = rigid.move(transform, clean)
     predicted = torch.from_numpy(transform[:3, :3])
     angle = float(rotation_error_deg(predicted[None], pairs.rotation[index, None].double()))
     return angle, float(KDTree(truth).query(moved)[0].mean())

@@ -134,7 +134,7 @@ def half_turned(transform: np.ndarray, subsamples: tuple[np.ndarray, np.ndarray]
         (3, 4, 4).
     """
     source, target = (cloud[:, :3] for cloud in subsamples)
-    points = np.concatenate([source @ transform[:3, :3].T + transform[:3, 3], target])
+    points = np.concatenate([rigid.move(transform, source), target])
     centre = points.mean(0)
     axes = np.linalg.eigh(np.cov(points.T))[1].T
     rotation = 2 * axes[:, :, None] * axes[:, None] - np.eye(3)

@@ -93,7 +93,7 @@ class Hypotheses(NamedTuple):
     ) -> np.ndarray:
         """Compute how well a transform explains each match, (K,) in [0, 1]; see `support`."""
         x, y = source[self.matches[:, 0], :3], target[self.matches[:, 1], :3]
-        residual = np.linalg.norm(x @ transform[:3, :3].T + transform[:3, 3] - y, axis=1)
+        residual = np.linalg.norm(rigid.move(transform, x) - y, axis=1)
         return np.clip(1 - (residual / _SUPPORT_DISTANCE) ** 2, 0, None)
 
 

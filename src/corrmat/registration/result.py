@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from corrmat.calibration import as_percent
 from corrmat.errors import CorrmatError
@@ -42,8 +43,7 @@ class Registration:
     @property
     def rotation_deg(self) -> float:
         """The rotation's angle."""
-        cosine = (np.trace(self.transform[:3, :3]) - 1) / 2
-        return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+        return float(np.degrees(Rotation.from_matrix(self.transform[:3, :3]).magnitude()))
 
 
 def to_text(registration: Registration) -> str:

@@ -10,6 +10,7 @@ import small_gicp
 from scipy.spatial import KDTree
 
 from corrmat.data.normals import NEIGHBORS
+from corrmat.ops import rigid
 from corrmat.registration.phase_correlation import PhaseCorrelation
 from corrmat.types import MATCH_DISTANCE
 
@@ -158,7 +159,7 @@ class AlignmentScorer:
         near = distance < self.max_distance
         if near.sum() < _TOO_SMALL:
             return None
-        points = self.source[near] @ transform[:3, :3].T
+        points = rigid.move(transform, self.source[near])
         normals = self.normals[1][index[near]]
         centred = points - points.mean(0)
         radius = np.sqrt(np.square(centred).sum(1).mean())
@@ -184,7 +185,7 @@ class AlignmentScorer:
     def _nearest_target(self, transform: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Find the nearest target point of every source point alone; see `_nearest`."""
         source, target = self._trees
-        return self._query(target, source.data @ transform[:3, :3].T + transform[:3, 3])
+        return self._query(target, rigid.move(transform, source.data))
 
     def _query(self, tree: KDTree, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Find the nearest point of a tree to each of `points`; see `_nearest`."""
