@@ -145,25 +145,29 @@ class Purpose(IntEnum):
     SHAPE = 7  # where every epoch has new shapes
 
 
-_NOTHING = np.empty(0, np.float32)
+class _CloudDraw(NamedTuple):
+    """Everything random about one of a pair's clouds; empty where the settings ask for nothing."""
+
+    index: np.ndarray  # (N,) points of the clean cloud
+    plane: np.ndarray  # (3,) Gaussian: direction of the crop plane
+    replaced: np.ndarray  # (round(outliers * n),) points after the crop
+    outliers: np.ndarray  # (..., 6) the points that replace them
+    noise: np.ndarray  # (n or N, 3) Gaussian
+    camera: np.ndarray  # (3,) in the source's frame
+    visible: np.ndarray  # (P / 2,) points of the clean cloud that the camera may see
 
 
 class _Draw(NamedTuple):
     """Everything random about a pair."""
 
-    source: np.ndarray  # (N,) indices into the clean cloud
-    target: np.ndarray  # (N,)
-    normal: np.ndarray  # (2, 3) Gaussian: directions of the rotation axis and of the crop plane
+    source: _CloudDraw
+    target: _CloudDraw
+    axis: np.ndarray  # (3,) Gaussian: direction of the rotation axis
     uniform: np.ndarray  # (5,) in [0, 1): angle, its sign, translation
-    noise: np.ndarray  # (n + N, 3) Gaussian
-    outlier: np.ndarray  # (round(outliers * n),) indices of source points
-    outlier_rows: np.ndarray  # (..., 6) the points that replace them
-    target_plane: np.ndarray  # (3,) Gaussian: direction of the target's crop plane
-    target_outlier: np.ndarray  # as outlier and outlier_rows, if both clouds are corrupted
-    target_outlier_rows: np.ndarray
-    stretch: np.ndarray  # (4,) in [0, 1): factors of the axes, mirror
-    cameras: np.ndarray  # (2, 3) of source and target, in the source's frame; empty without views
-    order: np.ndarray  # (P,) permutation, whose halves are what either camera may see; or empty
+    stretch: np.ndarray  # (4,) in [0, 1): factors of the axes, mirror; or empty
+
+
+_NOTHING = np.empty(0, np.float32)
 
 
 def make_pairs(
@@ -181,49 +185,25 @@ def make_pairs(
         B pairs; source and target carry normals behind the coordinates.
     """
     draws = [_draw(settings, clouds.num_points, key) for key in keys]
-    source_index, target_index = _stack(draws, "source"), _stack(draws, "target")
+    sides = [draw.source for draw in draws], [draw.target for draw in draws]
     clean = clouds.rows[np.asarray(shapes)]
     if settings.stretch > 1:
         clean = _stretch(clean, _stack(draws, "stretch"), settings.stretch)
-    source = np.take_along_axis(clean, source_index[..., None], 1)
-    target = np.take_along_axis(clean, target_index[..., None], 1)
-    both = settings.corrupted == "both"
-
-    if settings.num_source < settings.num_points:
-        kept = _crop(source[..., :3], _stack(draws, "normal")[:, 1], settings.num_source)
-        source = np.take_along_axis(source, kept[..., None], 1)
-        source_index = np.take_along_axis(source_index, kept, 1)
-        if both:
-            kept = _crop(target[..., :3], _stack(draws, "target_plane"), settings.num_source)
-            target = np.take_along_axis(target, kept[..., None], 1)
-    views = [(b, draw) for b, draw in enumerate(draws) if len(draw.cameras)]
-    for b, draw in views:
-        for cloud, camera, half in zip(
-            (source[b], target[b]), draw.cameras, np.array_split(draw.order, 2), strict=True
-        ):
-            cloud[:] = _seen(clean[b], half, camera, len(cloud))
-    if settings.outliers:
-        batch = np.arange(len(draws))[:, None]
-        source[batch, _stack(draws, "outlier")] = _stack(draws, "outlier_rows")
-        if both:
-            target[batch, _stack(draws, "target_outlier")] = _stack(draws, "target_outlier_rows")
+    (source, source_index), (target, target_index) = (
+        _sample(clean, side, settings) for side in sides
+    )
     if settings.sampling == "identical" and not settings.has_outliers:
         match = _same_points(source_index, target_index, clouds.num_points)
     else:
         match = _nearest(source[..., :3], target[..., :3], settings.max_match_distance)
-    if settings.jitter:
-        noise = settings.jitter * _stack(draws, "noise")
-        noises = noise[:, : settings.num_source], noise[:, settings.num_source :]
-        for cloud, offset, which in zip((source, target), noises, (0, 1), strict=True):
-            offset = offset[:, : cloud.shape[1]]
-            for b, draw in views:
-                offset[b] = depth_noise(cloud[b, :, :3], draw.cameras[which], offset[b])
-            cloud[..., :3] += offset
-    if settings.normals == "estimated":
-        for cloud in (*source, *target):
-            cloud[:, 3:] = estimate_normals(cloud[:, :3])
+    for cloud, side in zip((source, target), sides, strict=True):
+        if settings.jitter:
+            _add_noise(cloud, side, settings.jitter)
+        if settings.normals == "estimated":
+            for rows in cloud:
+                rows[:, 3:] = estimate_normals(rows[:, :3])
 
-    axis, uniform = _stack(draws, "normal")[:, 0], _stack(draws, "uniform")
+    axis, uniform = _stack(draws, "axis"), _stack(draws, "uniform")
     rotation, translation = _transform(axis, uniform, settings)
     # Points and normals rotate alike: one product over (B, 2N, 3); only points are translated.
     moved = torch.from_numpy(target).view(len(draws), -1, 3) @ rotation.mT
@@ -251,7 +231,7 @@ def _draw(settings: PairSettings, size: int, key: Key) -> _Draw:
     """Draw what the settings ask for, each purpose from its own stream."""
     rng = generator(key)
     n, both = settings.num_points, settings.corrupted == "both"
-    normal, uniform = rng.standard_normal((2, 3)), rng.random(5)
+    (axis, plane), uniform = rng.standard_normal((2, 3)), rng.random(5)
     source = rng.choice(size, n, replace=False)
     if settings.sampling == "identical":
         target = rng.permutation(source)
@@ -260,28 +240,30 @@ def _draw(settings: PairSettings, size: int, key: Key) -> _Draw:
     else:
         rest = np.setdiff1d(np.arange(size), source, assume_unique=True)
         target = rng.choice(rest, n, replace=False)
-    nothing = _NOTHING, _NOTHING
-    outliers = _draw_outliers(key, Purpose.OUTLIERS, settings) if settings.outliers else nothing
-    target_outliers = nothing
-    if settings.outliers and both:
-        target_outliers = _draw_outliers(key, Purpose.TARGET_OUTLIERS, settings)
-    noise = target_plane = stretch = _NOTHING
+    nothing = _NOTHING, _NOTHING  # of source and target
+    planes = plane, generator(key, Purpose.TARGET_CROP).standard_normal(3) if both else _NOTHING
+    outliers = [
+        _draw_outliers(key, purpose, settings) if settings.outliers and corrupted else nothing
+        for purpose, corrupted in ((Purpose.OUTLIERS, True), (Purpose.TARGET_OUTLIERS, both))
+    ]
+    noises = cameras = halves = nothing
     if settings.jitter:
         shape = settings.num_source + n, 3
         noise = generator(key, Purpose.JITTER).standard_normal(shape, np.float32)
-    if both:
-        target_plane = generator(key, Purpose.TARGET_CROP).standard_normal(3)
-    if settings.stretch > 1:
-        stretch = generator(key, Purpose.STRETCH).random(4)
-    cameras = order = _NOTHING
+        noises = np.split(noise, [settings.num_source])
     if settings.views:
         rng = generator(key, Purpose.VIEWS)
         if rng.random() < settings.views:
-            cameras, order = _draw_cameras(rng, settings.view_deg), rng.permutation(size)
-    return _Draw(
-        source, target, normal, uniform, noise, *outliers, target_plane, *target_outliers, stretch,
-        cameras, order,
-    )  # fmt: skip
+            cameras = _draw_cameras(rng, settings.view_deg)
+            halves = np.array_split(rng.permutation(size), 2)
+    stretch = generator(key, Purpose.STRETCH).random(4) if settings.stretch > 1 else _NOTHING
+    of_source, of_target = (
+        _CloudDraw(index, plane, replaced, rows, noise, camera, half)
+        for index, plane, (replaced, rows), noise, camera, half in zip(
+            (source, target), planes, outliers, noises, cameras, halves, strict=True
+        )
+    )
+    return _Draw(of_source, of_target, axis, uniform, stretch)
 
 
 def _draw_cameras(rng: np.random.Generator, view_deg: float) -> np.ndarray:
@@ -318,6 +300,39 @@ def _transform(
     rotation = rigid.axis_angle_to_matrix(torch.from_numpy(axis), torch.from_numpy(angle))
     translation = settings.translation * (2 * uniform[:, 2:] - 1)
     return rotation.float(), torch.from_numpy(translation).float()
+
+
+def _sample(
+    clean: np.ndarray, draws: Sequence[_CloudDraw], settings: PairSettings
+) -> tuple[np.ndarray, np.ndarray]:
+    """Sample clouds (B, n, 6) of clean ones, crop or view them, and replace points by outliers.
+
+    Returns:
+        The clouds, and which points of the clean ones they have, (B, n), unless they are views or
+        have outliers.
+    """
+    index = _stack(draws, "index")
+    clouds = np.take_along_axis(clean, index[..., None], 1)
+    if len(draws[0].plane) and settings.num_source < settings.num_points:
+        kept = _crop(clouds[..., :3], _stack(draws, "plane"), settings.num_source)
+        clouds = np.take_along_axis(clouds, kept[..., None], 1)
+        index = np.take_along_axis(index, kept, 1)
+    if settings.views:
+        for cloud, shape, draw in zip(clouds, clean, draws, strict=True):
+            if len(draw.camera):
+                cloud[:] = _seen(shape, draw.visible, draw.camera, len(cloud))
+    if len(draws[0].replaced):
+        batch = np.arange(len(draws))[:, None]
+        clouds[batch, _stack(draws, "replaced")] = _stack(draws, "outliers")
+    return clouds, index
+
+
+def _add_noise(clouds: np.ndarray, draws: Sequence[_CloudDraw], jitter: float) -> None:
+    """Add noise to the points of clouds (B, n, 6): of every coordinate, or along a camera's ray."""
+    offsets = jitter * _stack(draws, "noise")[:, : clouds.shape[1]]
+    for cloud, offset, draw in zip(clouds, offsets, draws, strict=True):
+        noise = depth_noise(cloud[:, :3], draw.camera, offset) if len(draw.camera) else offset
+        cloud[:, :3] += noise
 
 
 def _stretch(rows: np.ndarray, uniform: np.ndarray, most: float) -> np.ndarray:
@@ -362,5 +377,5 @@ def _nearest(source: np.ndarray, target: np.ndarray, max_distance: float) -> np.
     return np.stack(index).astype(np.int64)
 
 
-def _stack(draws: list[_Draw], name: str) -> np.ndarray:
+def _stack(draws: Sequence[_Draw] | Sequence[_CloudDraw], name: str) -> np.ndarray:
     return np.stack([getattr(draw, name) for draw in draws])
