@@ -2,11 +2,13 @@
 
 import json
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from corrmat.weights import shipped_metadata
 
+Verdict = Literal["aligned", "probably aligned", "doubtful"]
 # Least confidence of the verdicts "aligned" and "probably aligned". `make calibration` says how
 # many of the held-out pairs are called "aligned" wrongly: about 2 % at most should be.
 SURE, LIKELY = 0.94, 0.5
@@ -15,9 +17,15 @@ _LEAST_CORRELATION = 0.02  # unrelated clouds have some, too
 
 def verdict(confidence: float, reason: str) -> str:
     """Put a confidence into words, with the reason unless they are "aligned"."""
+    words = verdict_words(confidence)
+    return words if words == "aligned" else f"{words}: {reason}"
+
+
+def verdict_words(confidence: float) -> Verdict:
+    """Put a confidence into words, without a reason."""
     if confidence >= SURE:
         return "aligned"
-    return f"{'probably aligned' if confidence >= LIKELY else 'doubtful'}: {reason}"
+    return "probably aligned" if confidence >= LIKELY else "doubtful"
 
 
 def as_percent(confidence: float) -> str:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from corrmat.calibration import as_percent
+from corrmat.calibration import as_percent, verdict_words
 from corrmat.registration.result import Registration
 from corrmat.registration.scene import build_scene, extent
 from corrmat.reporting.figures import BLUE, GREEN, GREY, RED
@@ -87,8 +87,8 @@ def _title(registration: Registration, share: float, lines: int) -> str:
         return "source (orange) and target (blue)"
     if share < 1:
         return f"rotated by {registration.rotation_deg:.0f}°"
-    word, _, _ = registration.verdict.partition(":")  # the reason is too long for a title
-    return f"{word}, confidence {as_percent(registration.confidence)}"
+    words = verdict_words(registration.confidence)  # the reason is too long for a title
+    return f"{words}, confidence {as_percent(registration.confidence)}"
 
 
 def _camera(azimuth_deg: float) -> np.ndarray:

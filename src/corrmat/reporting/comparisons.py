@@ -2,14 +2,14 @@
 
 import json
 from pathlib import Path
-from typing import Any, NotRequired, TypedDict
+from typing import Any, NotRequired, TypedDict, get_args
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, NullLocator
 from scipy import stats
 
-from corrmat.calibration import shipped_calibration, verdict
+from corrmat.calibration import Verdict, shipped_calibration, verdict_words
 from corrmat.reporting.figures import BLUE, GREEN, RED, save
 from corrmat.reporting.model_results import Comparison, ModelResult, read_comparison
 from corrmat.reporting.tables import markdown_head, markdown_row
@@ -22,7 +22,6 @@ _PROTOCOLS = ("real", "views", "clean", "dense", "rooms")  # in the order of the
 _SMALL = "real", "views", "clean"  # clouds of at most 1,024 points
 # Protocols of each kind of clouds.
 _KINDS = {"small clouds": _SMALL, "dense scans of objects": ("dense",), "rooms": ("rooms",)}
-_VERDICTS = "aligned", "probably aligned", "doubtful"
 _BINS = 10  # of the expected calibration error
 _DRAWS = 1000  # of what chance alone makes of it
 
@@ -188,7 +187,7 @@ def confidence_table(results: Path) -> str:
             aligned = np.concatenate([result.aligned for result in ours])
             both.append((promised, aligned))
             verdicts = _verdicts(promised)
-            for words in _VERDICTS:
+            for words in get_args(Verdict):
                 inside = verdicts == words
                 if inside.any():
                     means = [f"{values[inside].mean():.0%}" for values in (promised, aligned)]
@@ -206,7 +205,7 @@ def confidence_table(results: Path) -> str:
         if strangers:
             confidence = np.concatenate([_confidence(result) for result in strangers])
             verdicts = _verdicts(confidence).tolist()
-            counts = ", ".join(f"{verdicts.count(words)} {words}" for words in _VERDICTS)
+            counts = ", ".join(f"{verdicts.count(words)} {words}" for words in get_args(Verdict))
             summaries += ["", f"{len(verdicts)} unrelated pairs of {what}: {counts}."]
     return "\n".join(lines + summaries)
 
@@ -316,7 +315,7 @@ def _read_unrelated(results: Path) -> list[tuple[str, ModelResult]]:
 
 def _verdicts(confidence: np.ndarray) -> np.ndarray:
     """Return the verdicts (n,) of confidences (n,), without their reasons."""
-    return np.array([verdict(each, "").partition(":")[0] for each in confidence])
+    return np.array([verdict_words(each) for each in confidence])
 
 
 def _confidence(result: ModelResult) -> np.ndarray:

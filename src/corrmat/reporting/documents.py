@@ -60,14 +60,19 @@ class Results:
         self.folder = folder
 
     @functools.cached_property
+    def all_records(self) -> list[Record]:
+        """The records of every scale and seed."""
+        return read_records(self.folder)
+
+    @functools.cached_property
     def records(self) -> list[Record]:
         """The records of README.md and docs/reproduction.md: every scale but smoke, seed 0."""
-        return [r for r in read_records(self.folder) if r.scale != "smoke" and r.seed == 0]
+        return [r for r in self.all_records if r.scale != "smoke" and r.seed == 0]
 
     @functools.cached_property
     def claims(self) -> list[Claim]:
         """The ledger, judged by the records of every scale but smoke and of every seed."""
-        return claims_of(read_records(self.folder), self.folder)
+        return claims_of(self.all_records, self.folder)
 
 
 def headline_table(results: Results) -> str:
@@ -186,10 +191,10 @@ def weights_table(records: Sequence[Record]) -> str:
     return "\n".join(lines)
 
 
-def seeds_table(results: Path) -> str:
+def seeds_table(results: Results) -> str:
     """Build the table of experiments that were trained from several seeds: medians of each."""
     groups: dict[tuple[str, str, str], dict[int, Record]] = defaultdict(dict)
-    for record in read_records(results):
+    for record in results.all_records:
         if record.scale != "smoke":
             groups[record.id, record.scale, record.data][record.seed] = record
     heads = ["experiment", "arm", "median rotation error by seed, deg", "correct matches, %"]
@@ -260,7 +265,7 @@ TABLES: tuple[tuple[str, str, Callable[[Results], str]], ...] = (
     ("docs/reproduction.md", "low_rate", lambda results: low_rate_table(results.folder)),
     ("docs/reproduction.md", "batch_norm", lambda results: batch_norm_table(results.folder)),
     ("docs/reproduction.md", "weights", lambda results: weights_table(results.records)),
-    ("docs/reproduction.md", "seeds", lambda results: seeds_table(results.folder)),
+    ("docs/reproduction.md", "seeds", seeds_table),
     ("docs/metrics.md", "tables", lambda results: markdown_tables(results.records)),
     ("docs/claims.md", "summary", lambda results: summarise_claims(results.claims)),
     ("docs/claims.md", "claims", lambda results: markdown_claims(results.claims)),
