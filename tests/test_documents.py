@@ -1,5 +1,7 @@
 """Every block of code in README and docs works: Python is executed, commands are parsed."""
 
+import inspect
+import itertools
 import re
 import shlex
 from pathlib import Path
@@ -10,6 +12,7 @@ from conftest import ROOT
 from sybil import Sybil
 from sybil.parsers.markdown import PythonCodeBlockParser
 
+import corrmat
 from corrmat.data.shapes import dataset
 from corrmat.methods import METHODS, DCPCorr
 from corrmat.networks.dcp import DCPNetwork
@@ -69,3 +72,16 @@ def test_every_test_that_reliability_md_names_exists():
     names = set(re.findall(r"::(test_\w+)", text))
     assert len(names) > 15
     assert not [name for name in names if f"def {name}(" not in code]
+
+
+def test_the_table_of_public_names_is_complete_and_names_real_parameters():
+    rows = re.findall(r"^\| (`.*?) \| (.*) \|$", (ROOT / "docs/api.md").read_text(), re.MULTILINE)
+    cells = itertools.chain.from_iterable(rows)
+    calls = [call for cell in cells for call in re.findall(r"`(\w+(?:\(.*?\))?)`", cell)]
+    names = {call.partition("(")[0] for call in calls}
+    assert set(corrmat.__all__) <= names
+    for call in calls:
+        name, _, parameters = call.rstrip(")").partition("(")
+        assert name in corrmat.__all__
+        known = {"*", *inspect.signature(getattr(corrmat, name)).parameters} if parameters else ()
+        assert set(filter(None, parameters.split(", "))) <= set(known)
