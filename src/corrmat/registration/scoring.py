@@ -19,8 +19,8 @@ LEVELS = 2048, 6_000, 20_000  # points of each cloud, to select a transform and 
 _TOO_SMALL = 10  # points, for small_gicp
 _SAME = 0.02  # of `max_distance`: points that lie nearer than this are one point
 _SHARED = 0.1  # share of the source's points that are the target's, too
-# Mean squared cosine, over aligned points, between the least resisted motion and the normals. Walls
-# and profiles that slide have 0.001 to 0.003; 99 % of the held-out pairs have more.
+# Mean squared cosine, over aligned points, between the least resisted motion and the normals; less
+# slides (benchmarks/sliding.py).
 _HELD = 0.003
 _SHIFT = 0.7  # length of the shift in a motion of length one: less is a turn
 

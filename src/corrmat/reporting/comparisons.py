@@ -18,6 +18,7 @@ from corrmat.weights import shipped_metadata
 OURS = "corrmat"
 TRAINING = Path("register", "training.json")  # below results/: how the shipped weights were trained
 UNRELATED = Path("register", "unrelated.json")  # what they make of clouds of two different things
+SLIDING = Path("register", "sliding.json")  # of clouds that may slide, and of others
 _PROTOCOLS = ("real", "views", "clean", "dense", "rooms")  # in the order of the tables
 _SMALL = "real", "views", "clean"  # clouds of at most 1,024 points
 # Protocols of each kind of clouds.
@@ -37,6 +38,16 @@ class TrainingRun(TypedDict):
     commit: str
     curve: list[dict[str, float]]  # on validation pairs
     validation: dict[str, float]  # share of each protocol's held-out pairs within 5 degrees
+
+
+class SlidingRow(TypedDict):
+    """A row of results/register/sliding.json."""
+
+    clouds: str
+    registrations: int
+    slides: int  # registrations whose source is said to slide
+    right: int | None  # of these, the right direction; None where nothing slides
+    aligned: int  # registrations that are called "aligned"
 
 
 def comparison_summary(results: Path) -> str:
@@ -297,6 +308,20 @@ def draw_training(results: Path) -> None:
 
 def _read_json(path: Path) -> dict[str, Any]:
     return json.loads(path.read_text())
+
+
+def sliding_table(results: Path) -> str:
+    """Build the table of what is said to slide: profiles, which do, and held-out pairs."""
+    path = results / SLIDING
+    if not path.is_file():
+        return "Sliding is not recorded; `benchmarks/sliding.py` measures it."
+    heads = ["clouds", "registrations", "said to slide", "in the right direction", "aligned"]
+    lines = markdown_head(heads)
+    for row in json.loads(path.read_text())["rows"]:
+        right = "" if row["right"] is None else str(row["right"])
+        counts = [str(row[name]) for name in ("registrations", "slides")]
+        lines.append(markdown_row([row["clouds"], *counts, right, str(row["aligned"])]))
+    return "\n".join(lines)
 
 
 def _read_comparisons(results: Path) -> list[Comparison]:
