@@ -25,7 +25,7 @@ from corrmat.revision import commit
 RESULTS = Path(__file__).resolve().parents[1] / "results"
 NOISE = 0.001, 0.003, 0.01  # of a profile's length
 POINTS = 1000, 8000
-SEEDS = 3
+SEEDS = 4
 PAIRS = 60
 LENGTH = 3.0
 ANGLE_DEG = 10.0  # between the direction that is said and the axis

@@ -19,9 +19,9 @@ LEVELS = 2048, 6_000, 20_000  # points of each cloud, to select a transform and 
 _TOO_SMALL = 10  # points, for small_gicp
 _SAME = 0.02  # of `max_distance`: points that lie nearer than this are one point
 _SHARED = 0.1  # share of the source's points that are the target's, too
-# Mean squared cosine, over aligned points, between the least resisted motion and the normals; less
-# slides (benchmarks/sliding.py).
-_HELD = 0.003
+# Least mean square of what surfaces resist of a motion that they hold: by the target's normals,
+# whose noise resists a little, and by the product of both clouds' (benchmarks/sliding.py).
+_HELD, _HELD_BY_BOTH = 0.01, 0.001
 _SHIFT = 0.7  # length of the shift in a motion of length one: less is a turn
 
 
@@ -149,7 +149,9 @@ class AlignmentScorer:
 
         A surface resists a point's motion along its normal. The mean square of what it resists is
         a quadratic form of turn and shift, whose eigenvectors of small values are free motions
-        (Gelfand et al., "Geometrically Stable Sampling for the ICP Algorithm", 3DIM 2003).
+        (Gelfand et al., "Geometrically Stable Sampling for the ICP Algorithm", 3DIM 2003). Noisy
+        normals seem to resist every motion. But the noise of source and target is independent: the
+        mean product of what their normals resist is without it, and has to be small, too.
 
         Returns:
             A unit vector, whose largest component is positive; None if no shift is free, or fewer
@@ -160,12 +162,17 @@ class AlignmentScorer:
         if near.sum() < _TOO_SMALL:
             return None
         points = rigid.move(transform, self.source[near])
+        arms = points - points.mean(0)
+        arms /= np.sqrt(np.square(arms).sum(1).mean())
         normals = self.normals[1][index[near]]
-        centred = points - points.mean(0)
-        radius = np.sqrt(np.square(centred).sum(1).mean())
-        resisted = np.hstack([np.cross(centred / radius, normals), normals])
-        values, motions = np.linalg.eigh(resisted.T @ resisted / len(resisted))
-        directions, lengths, _ = np.linalg.svd(motions[3:, values < _HELD])
+        others = self.normals[0][near] @ transform[:3, :3].T
+        others *= np.sign((normals * others).sum(1, keepdims=True))
+        resisted, by_source = (np.hstack([np.cross(arms, n), n]) for n in (normals, others))
+        values, motions = np.linalg.eigh(resisted.T @ resisted / len(arms))
+        free = motions[:, values < _HELD]
+        products = free.T @ (resisted.T @ by_source / len(arms)) @ free
+        values, mixed = np.linalg.eigh((products + products.T) / 2)
+        directions, lengths, _ = np.linalg.svd((free @ mixed[:, values < _HELD_BY_BOTH])[3:])
         if not len(lengths) or lengths[0] < _SHIFT:
             return None
         direction = directions[:, 0]
