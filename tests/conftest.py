@@ -49,6 +49,8 @@ def _no_cache_of_the_user(tmp_path_factory):
 def _quiet_and_offline(monkeypatch, tmp_path):
     monkeypatch.setenv("CORRMAT_CACHE", str(tmp_path / "cache"))
     console.print_messages(0)
+    yield
+    torch.set_flush_denormal(False)  # a command sets it for good
 
 
 @pytest.fixture
