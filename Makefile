@@ -16,6 +16,7 @@ OPTIONS = --scale $(SCALE) --data.data $(DATA) $(if $(ROOT),--data.root "$(ROOT)
 # What a cluster has trained anew is not trained a second time to be tested.
 RUN_OPTIONS = $(OPTIONS) $(if $(filter ray,$(LAUNCHER)),$(filter-out --fresh,$(ARGS)),$(ARGS))
 
+IN_PARALLEL := --numprocesses auto --maxprocesses 8 --dist worksteal --nbmake notebooks tests
 .PHONY: help $(EXPERIMENTS) outliers robustness all on-ray rates weights verification calibration checkpoints protocols docs docs-site report bench lint format test test-slow test-oldest lock clean
 
 help:  ## list the targets
@@ -81,7 +82,7 @@ format: .venv/ready  ## let ruff rewrite what it can
 	$(BIN)/ruff check --fix . && $(BIN)/ruff format .
 
 test: .venv/ready  ## everything but the slow learning tests, smoke training of every experiment included
-	$(BIN)/pytest --numprocesses auto --maxprocesses 8 --dist worksteal --nbmake notebooks tests
+	$(BIN)/pytest $(IN_PARALLEL)
 
 test-slow: .venv/ready  ## learning, kill -9 at any moment, SLURM, Ray, all checksums
 	$(BIN)/pytest -m slow
@@ -89,7 +90,7 @@ test-slow: .venv/ready  ## learning, kill -9 at any moment, SLURM, Ray, all chec
 test-oldest: .venv/ready  ## make test on the oldest versions that pyproject.toml allows
 	$(BIN)/uv venv --clear --quiet --python $(BIN)/python .venv-oldest
 	$(BIN)/uv pip install --quiet --python .venv-oldest/bin/python --resolution lowest-direct '.[dev]'
-	.venv-oldest/bin/python -m pytest
+	.venv-oldest/bin/python -m pytest $(IN_PARALLEL)
 
 lock: .venv/ready  ## compile requirements.lock anew from pyproject.toml
 	$(BIN)/uv pip compile pyproject.toml --extra dev --universal --python-version 3.11 \

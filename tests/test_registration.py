@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 from conftest import random_rotation, shared
-from matplotlib.text import Text
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -29,9 +28,9 @@ from corrmat.methods import InvariantCorr
 from corrmat.ops import rigid
 from corrmat.ops.correspondence import MatchabilityCorrespondence, SoftCorrespondence
 from corrmat.options import REGISTER_EPILOG
-from corrmat.registration import choice, example, preparation, result
+from corrmat.registration import animation, choice, example, preparation, result
 from corrmat.registration import register as registration
-from corrmat.registration.animation import _title, registration_gif
+from corrmat.registration.animation import registration_gif
 from corrmat.registration.em_icp import em_icp
 from corrmat.registration.hypotheses import (
     Hypotheses,
@@ -313,9 +312,8 @@ def test_a_copy_of_the_shipped_weights_is_calibrated_as_they_are(pair, tmp_path)
 
 @pytest.mark.parametrize(("model", "said"), [("icp", 0), ("corrmat", 13)])
 def test_the_animation_speaks_of_matches_where_there_are_some(pair, model, said, monkeypatch):
-    titles = []
-    original = Text.set_text
-    monkeypatch.setattr(Text, "set_text", lambda t, s: (titles.append(str(s)), original(t, s))[1])
+    titles, original = [], animation._title
+    monkeypatch.setattr(animation, "_title", lambda *a: titles.append(original(*a)) or titles[-1])
     _, source, target, _ = pair
     registration_gif(corrmat.register(source, target, model=model), source, target)
     assert sum("strongest matches" in title for title in titles) == said
@@ -348,9 +346,9 @@ def test_the_command_writes_what_it_promises(pair, tmp_path, capsys):
     transform = np.array(content["transform"])
     assert angle_deg(transform, truth) < 2
     assert np.allclose(read_scan(out), source @ transform[:3, :3].T + transform[:3, 3])
-    with Image.open(gif) as animation:
-        assert animation.n_frames == 54
-        first, last = (np.asarray(_frame(animation, at)) for at in (0, 53))
+    with Image.open(gif) as frames:
+        assert frames.n_frames == 54
+        first, last = (np.asarray(_frame(frames, at)) for at in (0, 53))
     assert (first != last).any()
     assert gif.stat().st_size < 1.5e6
     assert 1e6 < html.stat().st_size < 8e6
@@ -504,9 +502,9 @@ def test_shipped_weights_are_small_and_hold_no_pickle():
         assert content[8:9] == b"{"  # safetensors: a length, then JSON
 
 
-def _frame(animation, at):
-    animation.seek(at)
-    return animation.convert("RGB")
+def _frame(frames, at):
+    frames.seek(at)
+    return frames.convert("RGB")
 
 
 @pytest.mark.parametrize("model", ["ransac", "ransac17", "fgr", "kiss"])
@@ -577,7 +575,7 @@ def test_a_masked_array_is_refused(pair):
 
 def test_the_last_title_of_an_animation_fits_into_it(pair):
     result = corrmat.register(*np.random.default_rng(0).normal(size=(2, 200, 3)))
-    assert _title(result, 1.0, 0) == f"doubtful, confidence {as_percent(result.confidence)}"
+    assert animation._title(result, 1.0, 0) == f"doubtful, confidence {as_percent(result.confidence)}"
 
 
 @pytest.mark.parametrize(
