@@ -575,7 +575,9 @@ def test_a_masked_array_is_refused(pair):
 
 def test_the_last_title_of_an_animation_fits_into_it(pair):
     result = corrmat.register(*np.random.default_rng(0).normal(size=(2, 200, 3)))
-    assert animation._title(result, 1.0, 0) == f"doubtful, confidence {as_percent(result.confidence)}"
+    assert (
+        animation._title(result, 1.0, 0) == f"doubtful, confidence {as_percent(result.confidence)}"
+    )
 
 
 @pytest.mark.parametrize(
