@@ -118,10 +118,9 @@ def _evaluate(options: Namespace) -> int:
     _, result = experiment.evaluate(method, arm, loaded)
     titles = [f"{low:g} to {high:g} deg" for low, high in pairwise(loaded.bands_deg)]
     titles += [f"{share:.0%} outliers" for share in loaded.sweep_outliers]
-    parts = dict(zip(titles, [*result.bands, *result.sweep], strict=True))
     if not result.bands:
         _print_metrics(result.metrics)
-    for title, part in parts.items():
+    for title, part in zip(titles, [*result.bands, *result.sweep], strict=True):
         print(f"\n{title}")
         _print_metrics(part.metrics)
     return 0

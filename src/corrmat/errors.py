@@ -12,14 +12,14 @@ class CorrmatError(Exception):
     """User input cannot be used. The message names the input and says what to do."""
 
 
+class DivergedError(CorrmatError):
+    """A training loss is not finite."""
+
+
 _WHILE_WRITING = {
     errno.EACCES, errno.EDQUOT, errno.EEXIST, errno.EFBIG, errno.EIO, errno.EISDIR,
     errno.ENAMETOOLONG, errno.ENOSPC, errno.ENOTDIR, errno.EPERM, errno.EROFS,
 }  # fmt: skip
-
-
-class DivergedError(CorrmatError):
-    """A training loss is not finite."""
 
 
 def cannot_write(error: OSError) -> bool:

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from corrmat.ops.neighbors import gather_points
+from corrmat.ops.neighbors import at_least_float32, gather_points
 from corrmat.ops.sinkhorn import Slack, sinkhorn_potentials
 from corrmat.ops.streaming import argmax_rows, log_sums, softmax_rows
 
@@ -62,10 +62,10 @@ class SoftCorrespondence:
                 + ", ".join(map(str, shapes))
             )
         # Always float32 or wider: bfloat16 logits cannot tell near matches apart.
-        self.feature_source = _at_least_float32(feature_source)
-        self.feature_target = _at_least_float32(feature_target)
+        self.feature_source = at_least_float32(feature_source)
+        self.feature_target = at_least_float32(feature_target)
         self.scale = scale
-        self.outlier = None if outlier is None else _at_least_float32(outlier)
+        self.outlier = None if outlier is None else at_least_float32(outlier)
 
     @property
     def num_target(self) -> int:
@@ -218,7 +218,7 @@ class SinkhornCorrespondence(_LogCorrespondence):
         slack: Slack,
     ) -> None:
         super().__init__(feature_source, feature_target)
-        self.beta, self.alpha = _at_least_float32(beta), _at_least_float32(alpha)
+        self.beta, self.alpha = at_least_float32(beta), at_least_float32(alpha)
         self.iterations = iterations
         self.slack: Slack = slack
 
@@ -259,7 +259,7 @@ class MatchabilityCorrespondence(_LogCorrespondence):
         matchable_target: Tensor,
     ) -> None:
         super().__init__(feature_source, feature_target, scale, -matchable_source)
-        self.matchable_target = _at_least_float32(matchable_target)
+        self.matchable_target = at_least_float32(matchable_target)
 
     @_cached_with_gradient
     def _vectors(self) -> tuple[Tensor, Tensor, Tensor | None]:
@@ -311,8 +311,4 @@ def outlier_feature(feature_target: Tensor, b: float = -1.0) -> Tensor:
     eye = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
     # Without a check for errors, for which a GPU would have to wait: the ridge keeps it solvable.
     solution = torch.linalg.solve_ex(gram + ridge * eye, f.sum(1).unsqueeze(2)).result.squeeze(2)
-    return (b * solution).to(_at_least_float32(feature_target).dtype)
-
-
-def _at_least_float32(feature: Tensor) -> Tensor:
-    return feature if feature.dtype == torch.float64 else feature.float()
+    return (b * solution).to(at_least_float32(feature_target).dtype)

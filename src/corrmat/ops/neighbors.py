@@ -88,7 +88,7 @@ def within_radius(points: Tensor, radius: float, k: int) -> Tensor:
     batch, n, _ = points.shape
     rows = torch.arange(n, device=points.device).unsqueeze(1)
     wanted = torch.arange(1, k + 1, dtype=torch.int32, device=points.device)
-    points, parts = _at_least_float32(points), []
+    points, parts = at_least_float32(points), []
     for part in rows.split(max(1, _CHUNK // max(1, batch * n))):
         near = torch.cdist(points[:, part[:, 0]], points, compute_mode=_EXACT) <= radius
         near &= part != rows.mT
@@ -105,14 +105,14 @@ def nearest(points: Tensor, cloud: Tensor) -> Tensor:
     The result is exact, and only a slice of the distance matrix exists at a time.
     """
     rows = max(1, _CHUNK // max(1, cloud.shape[0] * cloud.shape[1]))
-    cloud = _at_least_float32(cloud)
-    parts = _at_least_float32(points).split(rows, 1)
+    cloud = at_least_float32(cloud)
+    parts = at_least_float32(points).split(rows, 1)
     return torch.cat([torch.cdist(x, cloud, compute_mode=_EXACT).argmin(-1) for x in parts], 1)
 
 
-def _at_least_float32(points: Tensor) -> Tensor:
-    """Return half precision as float32: `torch.cdist` has no kernels for it on CPUs."""
-    return points if points.dtype == torch.float64 else points.float()
+def at_least_float32(values: Tensor) -> Tensor:
+    """Return half precision as float32; `torch.cdist` has no kernels for it on CPUs."""
+    return values if values.dtype == torch.float64 else values.float()
 
 
 def gather_points(values: Tensor, index: Tensor) -> Tensor:

@@ -105,9 +105,7 @@ def register(
     confidence = _calibration().confidence(agreement, support if len(agrees) else None, *of_large)
     x, y = clouds.source, clouds.target
     fewest = min(len(x.rows), len(y.rows))
-    full = clouds.scorers[-1]
-    overlap, rmse = full.overlap_and_rmse(transform)
-    slides_along = full.sliding_direction(transform)
+    overlap, rmse, slides_along = clouds.scorers[-1].fit(transform)
     few_agree = len(agrees) > 0 and agrees.mean() < FEW_AGREE
     if fewest < FEW_POINTS or few_agree or slides_along is not None:
         confidence = min(confidence, DOUBTFUL)

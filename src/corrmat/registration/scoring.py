@@ -42,6 +42,14 @@ class Alignment(NamedTuple):
     distances: tuple[np.ndarray, np.ndarray]
 
 
+class Fit(NamedTuple):
+    """How a source lies on a target."""
+
+    overlap: float  # share of the source's points with a target point near
+    rmse: float  # root mean square distance of these; NaN without any
+    slides_along: np.ndarray | None  # (3,), a direction in which the target does not hold it
+
+
 class AlignmentScorer:
     """Refines transforms of one cloud onto another, and scores how well the two agree.
 
@@ -134,17 +142,17 @@ class AlignmentScorer:
         source, target = (np.linalg.svd(c, full_matrices=False)[0] for c in centred)
         return source, target
 
-    def overlap_and_rmse(self, transform: np.ndarray) -> tuple[float, float]:
-        """Compute the share of source points with a target point near, and their RMS distance.
+    def fit(self, transform: np.ndarray) -> Fit:
+        """Compute how the source lies on the target under a transform (4, 4)."""
+        distance, index = self._nearest_target(transform)
+        near = distance < self.max_distance
+        rmse = float(np.sqrt(np.mean(distance[near] ** 2))) if near.any() else np.nan
+        slides_along = self._sliding_direction(transform, near, index[near])
+        return Fit(float(near.mean()), rmse, slides_along)
 
-        The RMS distance is NaN without any such point.
-        """
-        to_target, _ = self._nearest_target(transform)
-        near = to_target[to_target < self.max_distance]
-        rmse = float(np.sqrt(np.mean(near**2))) if len(near) else np.nan
-        return len(near) / len(to_target), rmse
-
-    def sliding_direction(self, transform: np.ndarray) -> np.ndarray | None:
+    def _sliding_direction(
+        self, transform: np.ndarray, near: np.ndarray, nearest: np.ndarray
+    ) -> np.ndarray | None:
         """Find the direction (3,) in which the target's surfaces do not hold the aligned source.
 
         A surface resists a point's motion along its normal. The mean square of what it resists is
@@ -153,18 +161,21 @@ class AlignmentScorer:
         normals seem to resist every motion. But the noise of source and target is independent: the
         mean product of what their normals resist is without it, and has to be small, too.
 
+        Args:
+            transform: (4, 4).
+            near: (N,) bool, the K source points that have a target point near.
+            nearest: (K,) those target points.
+
         Returns:
             A unit vector, whose largest component is positive; None if no shift is free, or fewer
             than ten points are aligned.
         """
-        distance, index = self._nearest_target(transform)
-        near = distance < self.max_distance
-        if near.sum() < _TOO_SMALL:
+        if len(nearest) < _TOO_SMALL:
             return None
         points = rigid.move(transform, self.source[near])
         arms = points - points.mean(0)
         arms /= np.sqrt(np.square(arms).sum(1).mean())
-        normals = self.normals[1][index[near]]
+        normals = self.normals[1][nearest]
         others = self.normals[0][near] @ transform[:3, :3].T
         others *= np.sign((normals * others).sum(1, keepdims=True))
         resisted, by_source = (np.hstack([np.cross(arms, n), n]) for n in (normals, others))
