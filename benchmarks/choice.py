@@ -25,18 +25,13 @@ from corrmat.progress import track
 from corrmat.registration import benchmark
 from corrmat.registration.choice import (
     CHOICE_WEIGHTS,
+    CandidateSearch,
     ChoiceWeights,
     choose,
-    find_candidates,
-    measure,
-    refine_chosen,
-    refine_some,
 )
 from corrmat.registration.em_icp import em_icp
 from corrmat.registration.hypotheses import Hypotheses, NetworkHypotheses
-from corrmat.registration.preparation import prepare_clouds
 from corrmat.registration.shipping import held_out_pairs
-from corrmat.registration.verification import verify
 from corrmat.revision import commit
 from corrmat.types import PairBatch
 from corrmat.weights import load_model
@@ -60,7 +55,7 @@ _SEED = 5  # of pairs that nothing else uses
 class CandidateTables(NamedTuple):
     """What candidates are worth; the last of them is the true transform."""
 
-    measures: np.ndarray  # (T + 1, 5) of `measure`
+    measures: np.ndarray  # (T + 1, 5) of `CandidateSearch.measure`
     logits: np.ndarray  # (T + 1,) of the verification network
     errors: np.ndarray  # (2, T + 1, 2) degrees and ADD-S, after generalised ICP and after EM-ICP
 
@@ -78,9 +73,9 @@ class PairTables(NamedTuple):
 def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> PairTables:
     """Refine and measure the candidates of a pair, and the true transform in the same way."""
     source, target = (c[index].double().numpy() for c in (pairs.source, pairs.target))
-    clouds = prepare_clouds(source, target, 0)
-    subsamples, scorer = clouds.subsamples, clouds.scorers[0]
-    hypotheses = generate(*subsamples, 0)
+    search = CandidateSearch.start(generate, source, target, 0)
+    hypotheses, clouds = search.hypotheses, search.clouds
+    subsamples = clouds.subsamples
     truth = rigid.to_homogeneous(pairs.rotation[index], pairs.translation[index])
     truth = clouds.from_original_units(truth)
 
@@ -88,17 +83,17 @@ def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> Pair
         in_units = map(clouds.to_original_units, transforms)
         return np.array([benchmark.errors(pairs, index, t) for t in in_units])
 
-    found, measures = find_candidates(hypotheses, clouds, half_turns=True)
-    true = refine_some(truth[None], hypotheses, scorer)
+    found, measures = search.find(half_turns=True)
+    true = search.refine_a_little(truth[None])
     candidates = np.concatenate([found, true])
-    gicp = [scorer.refine(each) for each in candidates]
-    em = [refine_chosen(each, hypotheses, clouds) for each in candidates]
+    gicp = [clouds.scorers[0].refine(each) for each in candidates]
+    em = [search.refine_chosen(each) for each in candidates]
     return PairTables(
         len(hypotheses.transforms),
-        len(refine_some(hypotheses.transforms, hypotheses, scorer)),
+        len(search.refine_a_little(hypotheses.transforms)),
         CandidateTables(
-            np.concatenate([measures, measure(true, hypotheses, clouds)]),
-            verify(candidates, hypotheses, subsamples),
+            np.concatenate([measures, search.measure(true)]),
+            search.verify(candidates),
             np.stack([errors_of(each) for each in (gicp, em)]),
         ),
         errors_of(em_icp(truth, *subsamples, prior) for prior in (None, hypotheses.prob)),

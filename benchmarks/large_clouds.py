@@ -23,8 +23,14 @@ import open3d as o3d
 from corrmat.baselines import FpfhSettings, KissSettings, fpfh_ransac, kiss_matcher
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG
 from corrmat.progress import track
-from corrmat.registration import benchmark, choice
-from corrmat.registration.choice import CHOICE_WEIGHTS, LARGE_CLOUDS, ChoiceWeights
+from corrmat.registration import benchmark
+from corrmat.registration.choice import (
+    CHOICE_WEIGHTS,
+    LARGE_CLOUDS,
+    CandidateSearch,
+    ChoiceWeights,
+    choose,
+)
 from corrmat.registration.hypotheses import NetworkHypotheses
 from corrmat.registration.preparation import prepare_clouds
 from corrmat.registration.scoring import (
@@ -32,7 +38,6 @@ from corrmat.registration.scoring import (
     refine_coarse_to_fine,
     scorers_of_levels,
 )
-from corrmat.registration.verification import verify
 from corrmat.reporting.model_results import ModelResult, write_comparison
 from corrmat.revision import commit
 from corrmat.types import PairBatch
@@ -125,22 +130,18 @@ def choices_of(
 ) -> dict[str, tuple[float, float]]:
     """Return the errors, degrees and ADD-S, of one pair for every choice."""
     source, target = (c[index].double().numpy() for c in (pairs.source, pairs.target))
-    clouds = prepare_clouds(source, target, 0)
-    hypotheses = generate(*clouds.subsamples, 0)
-    own = choice.refine_some(hypotheses.transforms, hypotheses, clouds.scorers[0])
-    own_measures = choice.measure(own, hypotheses, clouds)
-    found, measures = choice.find_candidates(hypotheses, clouds, half_turns=True)
+    search = CandidateSearch.start(generate, source, target, 0)
+    own = search.refine_a_little(search.hypotheses.transforms)
+    own_measures = search.measure(own)
+    found, measures = search.find(half_turns=True)
 
     def chosen(among: np.ndarray, measured: np.ndarray, weights: ChoiceWeights) -> np.ndarray:
-        best = choice.choose(
-            measured, weights, lambda some: verify(among[some], hypotheses, clouds.subsamples)
-        )
-        return among[best]
+        return among[choose(measured, weights, lambda rows: search.verify(among[rows]))]
 
     @functools.cache
     def errors(transform: bytes) -> tuple[float, float]:
         matrix = np.frombuffer(transform).reshape(4, 4).copy()
-        final = clouds.to_original_units(choice.refine_chosen(matrix, hypotheses, clouds))
+        final = search.clouds.to_original_units(search.refine_chosen(matrix))
         return benchmark.errors(pairs, index, final)
 
     alone = "the network's candidates, no half turns"

@@ -800,10 +800,11 @@ def test_half_a_turn_of_the_best_candidate_is_a_candidate_too():
     np.testing.assert_allclose(np.trace(half, axis1=1, axis2=2), 0, atol=1e-9)
     for turn in turns:
         mistaken = Hypotheses(turn[None], np.empty((0, 2), int), np.empty(0))
-        found, measures = choice.find_candidates(mistaken, clouds, half_turns=True)
+        search = choice.CandidateSearch(mistaken, clouds)
+        found, measures = search.find(half_turns=True)
         assert len(found) == len(measures) == 4
         assert np.linalg.norm(found - truth, axis=(1, 2)).min() < 0.01
-        assert len(choice.find_candidates(mistaken, clouds, half_turns=False)[0]) == 1
+        assert len(search.find(half_turns=False)[0]) == 1
 
 
 def test_a_guess_is_one_more_candidate(pair):
@@ -876,7 +877,7 @@ def test_a_fragment_of_a_room_that_lies_right_stays_there():
     right = clouds.from_original_units(rigid.to_homogeneous(room.rotation, room.translation))
     slid = em_icp(right, *clouds.subsamples, hypotheses.prob)
     assert moved_m(room, clouds.to_original_units(slid)) > 0.1
-    refined = choice.refine_chosen(right, hypotheses, clouds)
+    refined = choice.CandidateSearch(hypotheses, clouds).refine_chosen(right)
     assert moved_m(room, clouds.to_original_units(refined)) < 0.01
 
 
@@ -889,12 +890,13 @@ def test_the_choice_is_by_agreement_coherence_unmatched_loss_and_support(pair):
     np.testing.assert_allclose(clouds.to_original_units(prepared), truth, atol=1e-9)
     transforms = np.stack([prepared] * 2)
     transforms[0, :3, :3] @= np.diag([-1.0, -1.0, 1.0])
-    wrong, right = choice.measure(transforms, hypotheses, clouds)
+    search = choice.CandidateSearch(hypotheses, clouds)
+    wrong, right = search.measure(transforms)
     better = np.sign([1.0, *choice.CHOICE_WEIGHTS[:-1]]) * (right - wrong)
     assert (better[[0, 2, 3]] > 0).all()
     measures = np.stack([wrong, right])
     assert choice.choose(measures, choice.CHOICE_WEIGHTS, np.zeros_like) == 1
-    wrongly, rightly = verify(transforms, hypotheses, clouds.subsamples)
+    wrongly, rightly = search.verify(transforms)
     assert rightly > wrongly
     assert not verify(transforms, hypotheses._replace(verification=None), clouds.subsamples).any()
 
@@ -913,7 +915,7 @@ def test_a_room_whose_matches_are_wrong_is_registered_by_phase_correlation(monke
     """Without it, this fragment comes out metres away."""
     room = make_room_pair(208, 20_000, "val")
     assert moved_m(room, registered(room)) < 0.02
-    monkeypatch.setattr(choice, "phase_correlation", lambda hypotheses, scorers: None)
+    monkeypatch.setattr(choice.CandidateSearch, "phase_correlation", None)
     assert moved_m(room, registered(room)) > 1
 
 

@@ -7,21 +7,26 @@ import numpy as np
 
 from corrmat.ops import rigid
 from corrmat.registration.em_icp import WIDTHS, em_icp
-from corrmat.registration.hypotheses import Hypotheses
+from corrmat.registration.hypotheses import Hypotheses, HypothesisGenerator
 from corrmat.registration.phase_correlation import PhaseCorrelation
-from corrmat.registration.preparation import MODEL_POINTS, PreparedClouds
+from corrmat.registration.preparation import (
+    MODEL_POINTS,
+    Cloud,
+    PreparedClouds,
+    prepare_clouds,
+)
 from corrmat.registration.scoring import (
     COARSE_POINTS,
     LEVELS,
-    AlignmentScorer,
     refine_coarse_to_fine,
 )
+from corrmat.registration.verification import verify
 
 
 class ChoiceWeights(NamedTuple):
     """A candidate scores its agreement + these times what the fields name.
 
-    All but the last are in the order of `measure`'s columns, whose first is the agreement.
+    All but the last are in the order of the measures' columns, whose first is the agreement.
     """
 
     coherence: float
@@ -51,78 +56,6 @@ def distinct(transforms: np.ndarray) -> np.ndarray:
     return kept
 
 
-def phase_correlation(hypotheses: Hypotheses, clouds: PreparedClouds) -> PhaseCorrelation | None:
-    """Return the phase correlation of two clouds, for models with matches; else None.
-
-    Its grid is too fine for two small clouds: there it is None as well.
-    """
-    if hypotheses.prob is None or len(clouds.scorers) == 1:
-        return None
-    return clouds.scorers[1].phase_correlation
-
-
-def correlation_of_large(hypotheses: Hypotheses, clouds: PreparedClouds) -> PhaseCorrelation | None:
-    """Return the phase correlation if both clouds are large; else None.
-
-    Where one is small, it finds candidates, but says little of how good they are.
-    """
-    full = clouds.scorers[-1]
-    large = min(len(full.source), len(full.target)) > LEVELS[0]
-    return phase_correlation(hypotheses, clouds) if large else None
-
-
-def weights_for(hypotheses: Hypotheses, clouds: PreparedClouds) -> ChoiceWeights:
-    """Return the weights of the choice among a model's candidates."""
-    if correlation_of_large(hypotheses, clouds):
-        return LARGE_CLOUDS
-    return WITHOUT_MATCHABILITIES if hypotheses.unmatched_nll is None else CHOICE_WEIGHTS
-
-
-def find_candidates(
-    hypotheses: Hypotheses, clouds: PreparedClouds, *, half_turns: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    """Refine and measure hypotheses, drop copies, and add what the best may be mistaken for.
-
-    If a cloud is large, the peaks of the phase correlation are hypotheses, too. A thing that is
-    nearly symmetric fits itself after half a turn. So the best candidates are turned by 180 degrees
-    about each principal axis as well.
-
-    Args:
-        hypotheses: of the model.
-        clouds: that they were made from.
-        half_turns: whether to add them. Only a verification network can tell them from the right
-            transform; the measures cannot.
-
-    Returns:
-        Transforms (T, 4, 4), half turns last, and their measures (T, 5).
-    """
-    scorer = clouds.scorers[0]
-    correlation = phase_correlation(hypotheses, clouds)
-    transforms = hypotheses.transforms
-    if correlation:
-        peaks = correlation.peaks(transforms[:, :3, :3], PEAKS)
-        transforms = np.concatenate([transforms, peaks])
-    refined = refine_some(transforms, hypotheses, scorer)
-    measures = measure(refined, hypotheses, clouds)
-    if not half_turns:
-        return refined, measures
-    weights = weights_for(hypotheses, clouds)
-    best = refined[best_by_measures(measures, weights, HALF_TURNED)]
-    turned = np.concatenate([half_turned(each, clouds.subsamples) for each in best])
-    candidates = distinct(np.concatenate([refined, refine_some(turned, hypotheses, scorer)]))
-    added = measure(candidates[len(refined) :], hypotheses, clouds)
-    return candidates, np.concatenate([measures, added])
-
-
-def refine_some(
-    transforms: np.ndarray, hypotheses: Hypotheses, scorer: AlignmentScorer
-) -> np.ndarray:
-    """Refine transforms (T, 4, 4) by generalised ICP, a little with matches, and drop copies."""
-    if hypotheses.prob is None:
-        return distinct(np.stack([scorer.refine(each) for each in transforms]))
-    return distinct(np.stack([scorer.coarse.refine(each, CANDIDATE_STEPS) for each in transforms]))
-
-
 def half_turned(transform: np.ndarray, subsamples: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     """Turn what a transform (4, 4) moves by 180 degrees, about each principal axis of both clouds.
 
@@ -141,29 +74,6 @@ def half_turned(transform: np.ndarray, subsamples: tuple[np.ndarray, np.ndarray]
     return rigid.to_homogeneous(rotation, centre - rotation @ centre) @ transform
 
 
-def measure(transforms: np.ndarray, hypotheses: Hypotheses, clouds: PreparedClouds) -> np.ndarray:
-    """Measure what the choice among transforms weighs.
-
-    Args:
-        transforms: (T, 4, 4).
-        hypotheses: of the model.
-        clouds: that they were made from.
-
-    Returns:
-        (T, 5): agreement, coherence, unmatched loss, support, and phase correlation (0 unless
-        both clouds are large).
-    """
-    correlation = correlation_of_large(hypotheses, clouds)
-    rows = []
-    for transform in transforms:
-        agreement, coherence, distances = clouds.scorers[0].alignment(transform)
-        unmatched = hypotheses.unmatched_loss(distances)
-        support = hypotheses.support(transform, *clouds.subsamples)
-        height = correlation.at(transform) if correlation else 0.0
-        rows.append((agreement, coherence, unmatched, support, height))
-    return np.reshape(rows, (-1, 5))
-
-
 def choose(
     measures: np.ndarray,
     weights: ChoiceWeights,
@@ -172,7 +82,7 @@ def choose(
     """Choose the candidate of the highest score; only the best by measures are verified.
 
     Args:
-        measures: (T, 5) of `measure`.
+        measures: (T, 5) of `CandidateSearch.measure`.
         weights: beside agreement's 1.
         verified: what `verify` says of the candidates at (n,) indices.
     """
@@ -193,39 +103,150 @@ def weigh(measures: np.ndarray, weights: ChoiceWeights) -> np.ndarray:
     return measures @ [1.0, *weights[:4]]
 
 
-def refine_chosen(
-    transform: np.ndarray, hypotheses: Hypotheses, clouds: PreparedClouds
-) -> np.ndarray:
-    """Refine the chosen transform (4, 4) by EM-ICP, on a few points and then on all of the model's.
-
-    With matches, the last iterations are enough for the second pass. Generalised ICP follows where
-    it is more exact: on points that the model has not seen, and on points that both clouds share.
-    In large clouds the model's points are too few, and a candidate slides along the walls of a
-    room: there it is shifted to the nearest peak of the phase correlation, and generalised ICP on
-    more and more points follows. Where only one cloud is large, or the model has no matches,
-    generalised ICP starts from the chosen transform and from EM-ICP's, and what agrees better is
-    taken.
+class CandidateSearch:
+    """The search for the transform of two clouds, from what a model says of them.
 
     Args:
-        transform: of the source onto the target.
-        hypotheses: from which it was chosen.
+        hypotheses: of the model.
         clouds: that they were made from.
     """
-    scorers = clouds.scorers
-    correlation = correlation_of_large(hypotheses, clouds)
-    if correlation:
-        return refine_coarse_to_fine(correlation.shifted(transform), scorers)
-    chosen = transform
-    source, target = (cloud[:COARSE_POINTS] for cloud in clouds.subsamples)
-    prob = hypotheses.prob
-    some = None if prob is None else prob[: len(source), : len(target)]
-    transform = em_icp(transform, source, target, some)
-    if max(map(len, clouds.subsamples)) > COARSE_POINTS:
-        widths = WIDTHS if prob is None else WIDTHS[-FINE_ITERATIONS:]
-        transform = em_icp(transform, *clouds.subsamples, prob, widths)
-    full = scorers[-1]
-    if len(scorers) > 1:
-        refined = [refine_coarse_to_fine(each, scorers) for each in (chosen, transform)]
-        return max(refined, key=lambda each: full.alignment(each).agreement)
-    more = max(len(full.source), len(full.target)) > MODEL_POINTS
-    return full.refine(transform) if more or full.shares_points(transform) else transform
+
+    def __init__(self, hypotheses: Hypotheses, clouds: PreparedClouds) -> None:
+        self.hypotheses, self.clouds = hypotheses, clouds
+        self._scorer = clouds.scorers[0]
+
+    @classmethod
+    def start(
+        cls,
+        generate: HypothesisGenerator,
+        source: np.ndarray | Cloud,
+        target: np.ndarray | Cloud,
+        seed: int,
+    ) -> "CandidateSearch":
+        """Prepare two clouds and ask a model for hypotheses; see `register`."""
+        clouds = prepare_clouds(source, target, seed)
+        return cls(generate(*clouds.subsamples, seed), clouds)
+
+    def add(self, transform: np.ndarray) -> None:
+        """Add a transform (4, 4) of the user's coordinates to the hypotheses."""
+        given = self.clouds.from_original_units(transform)
+        transforms = np.concatenate([self.hypotheses.transforms, given[None]])
+        self.hypotheses = self.hypotheses._replace(transforms=transforms)
+
+    @property
+    def phase_correlation(self) -> PhaseCorrelation | None:
+        """The phase correlation of the clouds, for models with matches; else None.
+
+        Its grid is too fine for two small clouds: there it is None as well.
+        """
+        scorers = self.clouds.scorers
+        with_matches = self.hypotheses.prob is not None
+        return scorers[1].phase_correlation if with_matches and len(scorers) > 1 else None
+
+    @property
+    def correlation_of_large(self) -> PhaseCorrelation | None:
+        """The phase correlation if both clouds are large; else None.
+
+        Where one is small, it finds candidates, but says little of how good they are.
+        """
+        full = self.clouds.scorers[-1]
+        large = min(len(full.source), len(full.target)) > LEVELS[0]
+        return self.phase_correlation if large else None
+
+    @property
+    def weights(self) -> ChoiceWeights:
+        """The weights of the choice among the candidates."""
+        if self.correlation_of_large:
+            return LARGE_CLOUDS
+        unmatched = self.hypotheses.unmatched_nll
+        return WITHOUT_MATCHABILITIES if unmatched is None else CHOICE_WEIGHTS
+
+    def find(self, *, half_turns: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Refine and measure hypotheses, drop copies, and add what the best may be mistaken for.
+
+        If a cloud is large, the peaks of the phase correlation are hypotheses, too. A thing that is
+        nearly symmetric fits itself after half a turn. So the best candidates are turned by 180
+        degrees about each principal axis as well.
+
+        Args:
+            half_turns: whether to add them. Only a verification network can tell them from the
+                right transform; the measures cannot.
+
+        Returns:
+            Transforms (T, 4, 4), half turns last, and their measures (T, 5).
+        """
+        correlation = self.phase_correlation
+        transforms = self.hypotheses.transforms
+        if correlation:
+            peaks = correlation.peaks(transforms[:, :3, :3], PEAKS)
+            transforms = np.concatenate([transforms, peaks])
+        refined = self.refine_a_little(transforms)
+        measures = self.measure(refined)
+        if not half_turns:
+            return refined, measures
+        best = refined[best_by_measures(measures, self.weights, HALF_TURNED)]
+        turned = np.concatenate([half_turned(each, self.clouds.subsamples) for each in best])
+        candidates = distinct(np.concatenate([refined, self.refine_a_little(turned)]))
+        added = self.measure(candidates[len(refined) :])
+        return candidates, np.concatenate([measures, added])
+
+    def refine_a_little(self, transforms: np.ndarray) -> np.ndarray:
+        """Refine transforms (T, 4, 4) by generalised ICP, and drop copies: to (D, 4, 4).
+
+        With matches, few iterations on few points do: EM-ICP follows.
+        """
+        if self.hypotheses.prob is None:
+            return distinct(np.stack([self._scorer.refine(each) for each in transforms]))
+        coarse = self._scorer.coarse
+        return distinct(np.stack([coarse.refine(each, CANDIDATE_STEPS) for each in transforms]))
+
+    def measure(self, transforms: np.ndarray) -> np.ndarray:
+        """Measure what the choice among transforms (T, 4, 4) weighs.
+
+        Returns:
+            (T, 5): agreement, coherence, unmatched loss, support, and phase correlation (0 unless
+            both clouds are large).
+        """
+        correlation = self.correlation_of_large
+        rows = []
+        for transform in transforms:
+            agreement, coherence, distances = self._scorer.alignment(transform)
+            unmatched = self.hypotheses.unmatched_loss(distances)
+            support = self.hypotheses.support(transform, *self.clouds.subsamples)
+            height = correlation.at(transform) if correlation else 0.0
+            rows.append((agreement, coherence, unmatched, support, height))
+        return np.reshape(rows, (-1, 5))
+
+    def verify(self, transforms: np.ndarray) -> np.ndarray:
+        """Score transforms (T, 4, 4) by the verification network: (T,) logits, zeros without."""
+        return verify(transforms, self.hypotheses, self.clouds.subsamples)
+
+    def refine_chosen(self, transform: np.ndarray) -> np.ndarray:
+        """Refine the chosen transform (4, 4) by EM-ICP, on a few points, then on all the model's.
+
+        With matches, the last iterations are enough for the second pass. Generalised ICP follows
+        where it is more exact: on points that the model has not seen, and on points that both
+        clouds share. In large clouds the model's points are too few, and a candidate slides along
+        the walls of a room: there it is shifted to the nearest peak of the phase correlation, and
+        generalised ICP on more and more points follows. Where only one cloud is large, or the model
+        has no matches, generalised ICP starts from the chosen transform and from EM-ICP's, and what
+        agrees better is taken.
+        """
+        scorers, subsamples = self.clouds.scorers, self.clouds.subsamples
+        correlation = self.correlation_of_large
+        if correlation:
+            return refine_coarse_to_fine(correlation.shifted(transform), scorers)
+        chosen = transform
+        source, target = (cloud[:COARSE_POINTS] for cloud in subsamples)
+        prob = self.hypotheses.prob
+        some = None if prob is None else prob[: len(source), : len(target)]
+        transform = em_icp(transform, source, target, some)
+        if max(map(len, subsamples)) > COARSE_POINTS:
+            widths = WIDTHS if prob is None else WIDTHS[-FINE_ITERATIONS:]
+            transform = em_icp(transform, *subsamples, prob, widths)
+        full = scorers[-1]
+        if len(scorers) > 1:
+            refined = [refine_coarse_to_fine(each, scorers) for each in (chosen, transform)]
+            return max(refined, key=lambda each: full.alignment(each).agreement)
+        more = max(len(full.source), len(full.target)) > MODEL_POINTS
+        return full.refine(transform) if more or full.shares_points(transform) else transform

@@ -11,18 +11,10 @@ from torch import nn
 
 from corrmat.calibration import Calibration, shipped_calibration, verdict
 from corrmat.errors import CorrmatError
-from corrmat.registration.choice import (
-    choose,
-    correlation_of_large,
-    find_candidates,
-    measure,
-    refine_chosen,
-    weights_for,
-)
+from corrmat.registration.choice import CandidateSearch, choose
 from corrmat.registration.hypotheses import CLASSICAL, HypothesisGenerator, NetworkHypotheses
-from corrmat.registration.preparation import Cloud, as_rigid, prepare_clouds
+from corrmat.registration.preparation import Cloud, as_rigid
 from corrmat.registration.result import Registration
-from corrmat.registration.verification import verify
 from corrmat.weights import load_model
 
 Refine = Literal["icp", "none"]
@@ -78,29 +70,23 @@ def register(
     else:
         generate = hypothesis_generator(str(model))
     start = time.perf_counter()
-    clouds = prepare_clouds(source, target, seed)
-    hypotheses = generate(*clouds.subsamples, seed)
+    search = CandidateSearch.start(generate, source, target, seed)
     if guess is not None:
-        transforms = hypotheses.transforms, clouds.from_original_units(guess)[None]
-        hypotheses = hypotheses._replace(transforms=np.concatenate(transforms))
-
+        search.add(guess)
+    hypotheses, clouds = search.hypotheses, search.clouds
     if refine == "icp":
-        half_turns = hypotheses.verification is not None
-        candidates, measures = find_candidates(hypotheses, clouds, half_turns=half_turns)
+        candidates, measures = search.find(half_turns=hypotheses.verification is not None)
     else:
         candidates = hypotheses.transforms
-        measures = measure(candidates, hypotheses, clouds)
-
-    def verified(rows: np.ndarray) -> np.ndarray:
-        return verify(candidates[rows], hypotheses, clouds.subsamples)
-
-    transform = candidates[choose(measures, weights_for(hypotheses, clouds), verified)]
+        measures = search.measure(candidates)
+    chosen = choose(measures, search.weights, lambda rows: search.verify(candidates[rows]))
+    transform = candidates[chosen]
     if refine == "icp":
-        transform = refine_chosen(transform, hypotheses, clouds)
+        transform = search.refine_chosen(transform)
     agreement, coherence, _ = clouds.scorers[0].alignment(transform)
     support = hypotheses.support(transform, *clouds.subsamples)
     agrees = hypotheses.match_support(transform, *clouds.subsamples) > 0
-    large = correlation_of_large(hypotheses, clouds)
+    large = search.correlation_of_large
     of_large = (coherence, large.at(transform)) if large else (None, None)
     confidence = _calibration().confidence(agreement, support if len(agrees) else None, *of_large)
     x, y = clouds.source, clouds.target

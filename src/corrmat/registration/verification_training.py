@@ -32,13 +32,11 @@ from corrmat.registration import benchmark
 from corrmat.registration.choice import (
     CHOICE_WEIGHTS,
     VERIFIED,
+    CandidateSearch,
     best_by_measures,
-    find_candidates,
     half_turned,
-    refine_some,
 )
 from corrmat.registration.hypotheses import NetworkHypotheses
-from corrmat.registration.preparation import prepare_clouds
 from corrmat.registration.shipping import recalibrate
 from corrmat.registration.verification import evidence
 from corrmat.revision import commit
@@ -158,21 +156,19 @@ def write_shard(path: Path, number: int, *, data: str, seed: int, count: int) ->
 def candidate_set(pairs: PairBatch, generate: NetworkHypotheses) -> CandidateSet:
     """Register a pair, a batch of one, up to its candidates, and label them."""
     source, target = (c[0].double().numpy() for c in (pairs.source, pairs.target))
-    clouds = prepare_clouds(source, target, 0)
-    hypotheses = generate(*clouds.subsamples, 0)
+    search = CandidateSearch.start(generate, source, target, 0)
+    clouds = search.clouds
     truth = rigid.to_homogeneous(pairs.rotation[0], pairs.translation[0])
     truth = clouds.from_original_units(truth)
-    candidates, measures = find_candidates(hypotheses, clouds, half_turns=True)
+    candidates, measures = search.find(half_turns=True)
     best = candidates[best_by_measures(measures, CHOICE_WEIGHTS, VERIFIED)]
-    scorer = clouds.scorers[0]
-    refined = refine_some(truth[None], hypotheses, scorer)
-    turned = half_turned(refined[0], clouds.subsamples)
-    half_turns = refine_some(turned, hypotheses, scorer)
+    refined = search.refine_a_little(truth[None])
+    half_turns = search.refine_a_little(half_turned(refined[0], clouds.subsamples))
     transforms = np.concatenate([best, half_turns, refined])
     offsets = clouds.subsamples[0][:, :3] @ (transforms - truth)[:, :3, :3].transpose(0, 2, 1)
     offsets += (transforms - truth)[:, None, :3, 3]
     right = np.linalg.norm(offsets, axis=2).mean(1) < RIGHT
-    features, points, nearest = evidence(transforms, hypotheses, clouds.subsamples)
+    features, points, nearest = evidence(transforms, search.hypotheses, clouds.subsamples)
     return CandidateSet(features.half(), points.half(), nearest.short(), torch.from_numpy(right))
 
 
