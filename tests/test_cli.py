@@ -13,7 +13,8 @@ from corrmat import options as command_options
 from corrmat.cli import main
 from corrmat.registration import benchmark
 from corrmat.reporting.claims import HIGH_RATE_CONTROL
-from corrmat.training import loggers, recipe
+from corrmat.training import experiment, loggers, recipe
+from corrmat.weights import load_model
 
 FIT = ["fit", "--config", str(ROOT / "configs" / "exp" / "1.1.yaml"), "--scale", "smoke"]
 
@@ -316,16 +317,34 @@ def test_evaluate_takes_shipped_weights(capsys):
     accuracy = next(line for line in shown.splitlines() if line.startswith("match_accuracy"))
     assert float(accuracy.split()[1]) > 0.8  # untrained: about 0.01
     assert main([*words, "2.2/RPMNet_corr"]) == 2
-    assert "fit" in capsys.readouterr().err
+    assert "does not fit: a RPMNetwork, where DCP_corr has a DCPNetwork" in capsys.readouterr().err
+    assert main([*words, "1.2/DCP_corr", "--network.k", "8"]) == 2
+    assert "1.2/DCP_corr has options of its network" in capsys.readouterr().err
+
+
+def test_evaluate_tests_weights_with_their_own_options(capsys, monkeypatch):
+    """Their tensors in the recipe's network would be another network: k, for one, has none."""
+    tested = []
+    monkeypatch.setattr(
+        experiment, "score", lambda method, *_: tested.append(method.network) or [{}]
+    )
+    monkeypatch.setattr(experiment, "summary", lambda values: {})
+    config = str(ROOT / "configs/exp/1.2.yaml")
+    few = ["--data.train_shapes", "20", "--data.test_shapes", "8"]
+    words = ["evaluate", "--config", config, "--scale", "smoke", *few]
+    assert main([*words, "--checkpoint", "1.2/DCP_corr"]) == 0
+    (network,) = tested
+    smoke = recipe.load(Path(config), "smoke").arms["DCP_corr"].network.k
+    assert network.embed.k == load_model("1.2/DCP_corr").embed.k != smoke
 
 
 def test_evaluate_tests_on_all_that_the_record_has(capsys):
     few = ["--scale", "smoke", "--data.train_shapes", "20", "--data.test_shapes", "8"]
-    for experiment, arm, titles in (
+    for name, arm, titles in (
         ("1.4", "DCP_corr", ["0 to 30 deg", "30 to 60 deg", "150 to 180 deg"]),
         ("outliers", "DCP_corr_matchability", ["0% outliers", "10% outliers", "40% outliers"]),
     ):
-        config = str(ROOT / f"configs/exp/{experiment}.yaml")
+        config = str(ROOT / f"configs/exp/{name}.yaml")
         words = ["--config", config, *few, "--arm", arm]
         assert main(["fit", *words, "--logger", "none"]) == main(["evaluate", *words]) == 0
         shown = capsys.readouterr().out.splitlines()

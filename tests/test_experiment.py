@@ -743,6 +743,20 @@ def test_an_interrupted_run_keeps_no_weights_that_are_not_finite(tmp_path, monke
         interrupt.on_train_batch_end(trainer, method, None, None, 0)
 
 
+def test_a_run_that_diverges_is_finished_in_wandb(tmp_path, monkeypatch, no_network):
+    """Else the next arm would log into its run."""
+    import wandb
+
+    monkeypatch.setattr(RegistrationModule, "require_finite_loss", diverge)
+    with pytest.raises(DivergedError):
+        train(load("1.1").arms["DCP_corr"], tmp_path / "run", logger="wandb")
+    assert wandb.run is None
+
+
+def diverge(self, where):
+    raise DivergedError("the loss is nan")
+
+
 def test_checkpoints_reload_to_the_same_network(tmp_path):
     settings = load("1.1").arms["DCP_corr"]
     trained = train(settings, tmp_path / "run")

@@ -54,8 +54,9 @@ def test_every_recipe_builds_at_every_scale(path, scale):
 def test_the_frozen_test_pairs_are_the_recipes(path, scale, data):
     if (scale, data) == ("paper", "modelnet40"):
         pytest.skip("the paper's scale is for the whole of ModelNet40")
-    root = {"root": str(shared("data"))} if data == "modelnet40" else {}
-    experiment = recipe.load(path, scale, {"data": {"data": data} | root})
+    part = {"root": str(shared("data")), "categories": ["bathtub", "airplane"]}
+    overrides = {"data": data, **(part if data == "modelnet40" else {})}
+    experiment = recipe.load(path, scale, {"data": overrides})
     assert experiment.test_pairs
     for settings in experiment.arms.values():
         digest = datamodule_of(settings).test_pairs_digest(experiment.test_changes)
@@ -77,7 +78,11 @@ def test_a_digest_is_only_for_the_pairs_that_it_was_made_of():
     for options in (["--seed", "1"], ["--data.keep=0.5"], ["--data.test_shapes", "7"]):
         assert load("1.2", "smoke", *options).test_pairs is None
     assert load("1.2", "smoke", "--data.data", "folder").test_pairs is None
-    assert load("1.2", "smoke", "--data.data", "modelnet40").test_pairs not in (None, expected)
+    modelnet40 = ["--data.data", "modelnet40"]
+    assert load("1.2", "smoke", *modelnet40).test_pairs is None, "of the whole it is not recorded"
+    for part in ("[airplane,bathtub]", "[bathtub,airplane]"):
+        found = load("1.2", "smoke", *modelnet40, "--data.categories", part).test_pairs
+        assert found not in (None, expected)
 
 
 @pytest.mark.parametrize("path", RECIPES, ids=lambda p: p.stem)

@@ -868,6 +868,29 @@ def test_a_profile_that_may_slide_along_itself_is_doubtful(count):
     assert held.verdict == "aligned"
 
 
+@pytest.mark.parametrize("count", [800, 3000])
+def test_a_solid_of_revolution_fits_after_any_turn_about_its_axis(count):
+    rng = np.random.default_rng(0)
+    rotation = Rotation.from_rotvec([0.3, -0.5, 1.0]).as_matrix()
+
+    def cone():
+        height, angle = 1 - np.sqrt(rng.random(count)), rng.uniform(0, 2 * np.pi, count)
+        radius = (1 - height) / 2
+        points = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], 1)
+        return points + rng.normal(0, 0.003, (count, 3))
+
+    found = corrmat.register(cone(), cone() @ rotation.T)
+    axis = rotation[:, 2] * np.sign(rotation[np.abs(rotation[:, 2]).argmax(), 2])
+    np.testing.assert_allclose(found.turns_about, axis, atol=0.05)
+    assert found.slides_along is None
+    assert not found.verdict.startswith("doubtful")
+    assert "after any turn about (" in result.to_text(found)
+    assert json.loads(result.to_json(found, "a", "b"))["turns_about"] == found.turns_about.tolist()
+    with_handle = [rng.normal([0.6, 0, 0.3], 0.05, (count // 10, 3))]
+    source, target = (np.vstack([cone(), *with_handle]) for _ in range(2))
+    assert corrmat.register(source, target @ rotation.T).turns_about is None
+
+
 def test_a_fragment_of_a_room_that_lies_right_stays_there():
     """EM-ICP alone slides it along its walls."""
     room = make_room_pair(12, 20_000, "val")

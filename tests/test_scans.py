@@ -200,6 +200,18 @@ def test_points_of_a_ply_with_edges_are_points(tmp_path):
     assert (read_scan(tmp_path / "lines.ply") == POINTS).all()
 
 
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("quoted.csv", 'id,x,y,z,name\n1,1,2,3,"a, b"\n2,4,5,6,"c"\n'),
+        ("labels.xyz", "2\nwater\nC1 1 2 3\nH2 4 5 6\n"),
+    ],
+)
+def test_words_beside_the_coordinates_are_skipped(tmp_path, name, content):
+    (tmp_path / name).write_text(content)
+    np.testing.assert_array_equal(read_scan(tmp_path / name), [[1, 2, 3], [4, 5, 6]])
+
+
 def test_textures_are_not_read(tmp_path, monkeypatch):
     """Those of a photograph take more memory than its mesh."""
     box = trimesh.creation.box((2, 2, 2))
@@ -236,6 +248,7 @@ def _bytes_of(array):
         ("words.xyz", b"1 2 3\none two 3\n", "cannot be read as XYZ"),
         ("header.csv", b"x,y,z\n", "holds no points"),
         ("german.csv", b"x;y;z\n1,5;2,5;3,5\n", "need a decimal point"),
+        ("holz.csv", b"x;y;z;class\n1,5;2,5;3,5;Holz\n", "need a decimal point"),
         ("complex.npy", _bytes_of(np.ones((9, 3), complex)), "complex128"),
         ("side.npy", _bytes_of(np.ones((4, 40))), "transpose it"),
         ("depth.npy", _bytes_of(np.ones((48, 64))), "a depth image has to be turned into points"),

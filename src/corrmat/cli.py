@@ -92,7 +92,7 @@ def _evaluate(options: Namespace) -> int:
     """Test the checkpoint of one arm."""
     loaded = _load_arm(options)
     from corrmat.training import experiment, fit, preflight, runs
-    from corrmat.weights import load_model, load_state
+    from corrmat.weights import load_model
 
     name = loaded.treatment
     folders = runs.arm_folders(loaded, name, options.runs)
@@ -104,6 +104,8 @@ def _evaluate(options: Namespace) -> int:
     given = options.checkpoint
     network = None
     if given is not None and given.suffix != ".ckpt":
+        if "network" in options.overrides:
+            raise CorrmatError(f"{given} has options of its network: --network.* changes none")
         network = load_model(given)
     elif given is not None and not given.is_file():
         raise CorrmatError(f"no checkpoint {given}; train first (corrmat fit)")
@@ -113,7 +115,10 @@ def _evaluate(options: Namespace) -> int:
         method = fit.load_trained(arm, checkpoint)
     else:
         method = preflight.build_method(arm.settings)
-        load_state(method.network, network.state_dict())
+        kinds = [type(each).__name__ for each in (network, method.network)]
+        if kinds[0] != kinds[1]:
+            raise CorrmatError(f"{given} does not fit: a {kinds[0]}, where {name} has a {kinds[1]}")
+        method.network = network
     print(f"checkpoint: {checkpoint}")
     _, result = experiment.evaluate(method, arm, loaded)
     titles = [f"{low:g} to {high:g} deg" for low, high in pairwise(loaded.bands_deg)]

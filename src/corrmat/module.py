@@ -83,7 +83,7 @@ class RegistrationModule(L.LightningModule):
         freeze_at = self.optimizer_settings.freeze_norms * self.trainer.estimated_stepping_batches
         if self.global_step >= freeze_at:
             for module in self.modules():
-                if isinstance(module, nn.BatchNorm1d):
+                if isinstance(module, nn.modules.batchnorm._BatchNorm):
                     module.eval()
 
     def training_step(self, batch: PairBatch, batch_index: int) -> Tensor:

@@ -4,6 +4,7 @@ Each reader is imported on first use: together they take longer than a registrat
 """
 
 import contextlib
+import csv
 import io
 import re
 from collections.abc import Iterable, Sequence
@@ -304,7 +305,7 @@ def _text(path: Path) -> np.ndarray:
     if not lines:
         return np.empty((0, 3))
     last = re.split(r"[;\s]+", lines[-1])
-    if len(last) > 1 and all(map(_DECIMAL_COMMA, last)):
+    if sum(map(bool, map(_DECIMAL_COMMA, last))) > 2:  # "1,5;2,5;3,5", and not "1,2,3 4,5,6"
         raise CorrmatError(f"{path}: numbers like 1,5 need a decimal point")
     count = int(lines.pop(0)) if lines[0].isdigit() else 0  # of points, in PTS and XYZ files
     if count and len(lines) == count + 1 and not _XYZ.issubset(lines[0].lower().split()):
@@ -313,7 +314,7 @@ def _text(path: Path) -> np.ndarray:
     separator = next((mark for mark in ";," if mark in sample), None)
     columns = [0, 1, 2]
     first = _cells(lines[0].lstrip("/ "), separator) if lines else []
-    if count and len(first) > 3 and first[0].isalpha():
+    if count and len(first) > 3 and not _is_number(first[0]) and all(map(_is_number, first[1:4])):
         columns = [1, 2, 3]
     elif lines and not any(map(_is_number, first)):  # a header
         names = [word.lower() for word in first]
@@ -361,8 +362,9 @@ def _check_rows(path: Path, lines: list[str], separator: str | None, columns: li
 
 
 def _cells(line: str, separator: str | None) -> list[str]:
-    """Split a line at its separator, or else at its white space; take off quotes."""
-    return [cell.strip().strip("\"'") for cell in line.split(separator)]
+    """Split a line at its separator outside of quotes, or else at its white space."""
+    cells = line.split() if separator is None else next(csv.reader([line], delimiter=separator))
+    return [cell.strip().strip("\"'") for cell in cells]
 
 
 def _is_number(word: str) -> bool:

@@ -14,7 +14,7 @@ from corrmat.errors import CorrmatError
 from corrmat.registration.choice import CandidateSearch, choose
 from corrmat.registration.hypotheses import CLASSICAL, HypothesisGenerator, NetworkHypotheses
 from corrmat.registration.preparation import Cloud, as_rigid
-from corrmat.registration.result import Registration
+from corrmat.registration.result import Registration, direction_text
 from corrmat.weights import load_model
 
 Refine = Literal["icp", "none"]
@@ -91,7 +91,7 @@ def register(
     confidence = _calibration().confidence(agreement, support if len(agrees) else None, *of_large)
     x, y = clouds.source, clouds.target
     fewest = min(len(x.rows), len(y.rows))
-    overlap, rmse, slides_along = clouds.scorers[-1].fit(transform)
+    overlap, rmse, slides_along, turns_about = clouds.scorers[-1].overlap(transform)
     few_agree = len(agrees) > 0 and agrees.mean() < FEW_AGREE
     if fewest < FEW_POINTS or few_agree or slides_along is not None:
         confidence = min(confidence, DOUBTFUL)
@@ -110,6 +110,7 @@ def register(
         rmse=rmse / clouds.scale,
         overlap=overlap,
         slides_along=slides_along,
+        turns_about=turns_about,
         verdict=verdict(
             confidence, _reason(agrees, overlap, slides_along, x.median / y.median, fewest)
         ),
@@ -134,8 +135,8 @@ def _reason(
     reasons = [f"{agrees.sum()} of {len(agrees)} matches agree"] if len(agrees) else []
     reasons.append(f"{overlap:.0%} of the source lies on the target")
     if slides_along is not None:
-        x, y, z = slides_along.round(2) + 0.0
-        reasons.append(f"the aligned surfaces do not keep it from sliding along ({x}, {y}, {z})")
+        along = direction_text(slides_along)
+        reasons.append(f"the aligned surfaces do not keep it from sliding along {along}")
     if fewest < FEW_POINTS:
         reasons.append(f"a cloud has only {fewest} points")
     if max(size, 1 / size) > OTHER_SIZE:

@@ -28,6 +28,7 @@ class Registration:
     rmse: float  # of aligned source points near a target point, in the clouds' units
     overlap: float  # share of source points near a target point: twice the spacing of points
     slides_along: np.ndarray | None  # (3,) in the target's axes: where its surfaces do not hold it
+    turns_about: np.ndarray | None  # (3,) likewise, the axis about which any turn fits as well
     verdict: str  # "aligned", or "probably aligned: " or "doubtful: " and why
     model: str
     seed: int
@@ -67,6 +68,9 @@ def to_text(registration: Registration) -> str:
         f"{note_on_confidence(registration.calibrated)}",
         f"verdict      {registration.verdict}",
     ]
+    if registration.turns_about is not None:
+        axis = direction_text(registration.turns_about)
+        lines.append(f"symmetry     the clouds fit as well after any turn about {axis}")
     lines.append(f"({registration.model}, seed {registration.seed}, {registration.seconds:.2f} s)")
     return "\n".join(filter(None, lines))
 
@@ -86,6 +90,12 @@ def read_transform(path: Path) -> np.ndarray:
         raise CorrmatError(f"{path} holds no matrix ({type(error).__name__}: {error})") from error
 
 
+def direction_text(direction: np.ndarray) -> str:
+    """Format a unit vector (3,)."""
+    x, y, z = direction.round(2) + 0.0
+    return f"({x}, {y}, {z})"
+
+
 def note_on_confidence(calibrated: bool) -> str:
     """Say which confidence was not fitted to its model and refinement."""
     return "" if calibrated else "  (fitted to the shipped weights with ICP, not to these options)"
@@ -102,8 +112,9 @@ def to_json(registration: Registration, source: str, target: str) -> str:
     values = {name: getattr(registration, name) for name in names}
     if not np.isfinite(registration.rmse):
         values["rmse"] = None
-    slides = registration.slides_along
-    values["slides_along"] = None if slides is None else slides.tolist()
+    for name in ("slides_along", "turns_about"):
+        direction = getattr(registration, name)
+        values[name] = None if direction is None else direction.tolist()
     files = {"source": source, "target": target}
     content = {**files, "transform": registration.transform.tolist(), **values}
     return json.dumps(content, indent=1) + "\n"

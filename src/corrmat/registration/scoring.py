@@ -22,7 +22,7 @@ _SHARED = 0.1  # share of the source's points that are the target's, too
 # Least mean square of what surfaces resist of a motion that they hold: by the target's normals,
 # whose noise resists a little, and by the product of both clouds' (benchmarks/sliding.py).
 _HELD, _HELD_BY_BOTH = 0.01, 0.001
-_SHIFT = 0.7  # length of the shift in a motion of length one: less is a turn
+_MAIN = 0.7  # least length of the shift, or the turn, in a free motion of length one
 
 
 class Alignment(NamedTuple):
@@ -42,12 +42,13 @@ class Alignment(NamedTuple):
     distances: tuple[np.ndarray, np.ndarray]
 
 
-class Fit(NamedTuple):
+class Overlap(NamedTuple):
     """How a source lies on a target."""
 
-    overlap: float  # share of the source's points with a target point near
+    share: float  # of the source's points that have a target point near
     rmse: float  # root mean square distance of these; NaN without any
     slides_along: np.ndarray | None  # (3,), a direction in which the target does not hold it
+    turns_about: np.ndarray | None  # (3,), the axis of a turn that the target does not hold
 
 
 class AlignmentScorer:
@@ -142,18 +143,18 @@ class AlignmentScorer:
         source, target = (np.linalg.svd(c, full_matrices=False)[0] for c in centred)
         return source, target
 
-    def fit(self, transform: np.ndarray) -> Fit:
+    def overlap(self, transform: np.ndarray) -> Overlap:
         """Compute how the source lies on the target under a transform (4, 4)."""
         distance, index = self._nearest_target(transform)
         near = distance < self.max_distance
         rmse = float(np.sqrt(np.mean(distance[near] ** 2))) if near.any() else np.nan
-        slides_along = self._sliding_direction(transform, near, index[near])
-        return Fit(float(near.mean()), rmse, slides_along)
+        slides_along, turns_about = self._free_motions(transform, near, index[near])
+        return Overlap(float(near.mean()), rmse, slides_along, turns_about)
 
-    def _sliding_direction(
+    def _free_motions(
         self, transform: np.ndarray, near: np.ndarray, nearest: np.ndarray
-    ) -> np.ndarray | None:
-        """Find the direction (3,) in which the target's surfaces do not hold the aligned source.
+    ) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """Find the motions that the target's surfaces leave to the aligned source.
 
         A surface resists a point's motion along its normal. The mean square of what it resists is
         a quadratic form of turn and shift, whose eigenvectors of small values are free motions
@@ -167,11 +168,12 @@ class AlignmentScorer:
             nearest: (K,) those target points.
 
         Returns:
-            A unit vector, whose largest component is positive; None if no shift is free, or fewer
-            than ten points are aligned.
+            The direction of a free shift, and the axis of a free turn: unit vectors (3,), whose
+            largest component is positive. None without such a motion, or with fewer than ten
+            aligned points.
         """
         if len(nearest) < _TOO_SMALL:
-            return None
+            return None, None
         points = rigid.move(transform, self.source[near])
         arms = points - points.mean(0)
         arms /= np.sqrt(np.square(arms).sum(1).mean())
@@ -183,11 +185,8 @@ class AlignmentScorer:
         free = motions[:, values < _HELD]
         products = free.T @ (resisted.T @ by_source / len(arms)) @ free
         values, mixed = np.linalg.eigh((products + products.T) / 2)
-        directions, lengths, _ = np.linalg.svd((free @ mixed[:, values < _HELD_BY_BOTH])[3:])
-        if not len(lengths) or lengths[0] < _SHIFT:
-            return None
-        direction = directions[:, 0]
-        return direction * np.sign(direction[np.abs(direction).argmax()])
+        turns, shifts = np.split(free @ mixed[:, values < _HELD_BY_BOTH], 2)
+        return _main_direction(shifts), _main_direction(turns)
 
     def _nearest(self, transform: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """Find the nearest target point of every source point, and the other way round.
@@ -210,6 +209,22 @@ class AlignmentScorer:
         farthest = max(self.max_distance, MATCH_DISTANCE)
         distance, index = tree.query(points, distance_upper_bound=farthest)
         return np.asarray(distance), np.minimum(index, tree.n - 1)
+
+
+def _main_direction(parts: np.ndarray) -> np.ndarray | None:
+    """Return the direction of the shift, or of the turn, that free motions mostly are.
+
+    Args:
+        parts: (3, F), the shifts, or the turns, of F orthonormal motions.
+
+    Returns:
+        A unit vector (3,), whose largest component is positive; None if no motion is mostly that.
+    """
+    directions, lengths, _ = np.linalg.svd(parts)
+    if not len(lengths) or lengths[0] < _MAIN:
+        return None
+    direction = directions[:, 0]
+    return direction * np.sign(direction[np.abs(direction).argmax()])
 
 
 def scorers_of_levels(source: np.ndarray, target: np.ndarray) -> list[AlignmentScorer]:

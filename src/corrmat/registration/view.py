@@ -6,7 +6,7 @@ import numpy as np
 import plotly.graph_objects as go
 
 from corrmat.calibration import as_percent
-from corrmat.registration.result import Registration, matrix_lines
+from corrmat.registration.result import Registration, direction_text, matrix_lines
 from corrmat.registration.scene import build_scene, extent
 from corrmat.reporting.figures import BLUE, GREEN, GREY, RED
 from corrmat.reporting.html import render
@@ -60,9 +60,11 @@ def registration_page(
         "rotvec": scene.rotvec.tolist(),
         "beside": scene.beside,
     }
+    axis = registration.turns_about
     return render(
         "registration.html.j2",
         registration=registration,
+        axis=None if axis is None else direction_text(axis),
         confidence=as_percent(registration.confidence),
         names=names,
         matrix="\n".join(matrix_lines(registration.transform)),

@@ -18,7 +18,7 @@ from corrmat.weights import shipped_metadata
 OURS = "corrmat"
 TRAINING = Path("register", "training.json")  # below results/: how the shipped weights were trained
 UNRELATED = Path("register", "unrelated.json")  # what they make of clouds of two different things
-SLIDING = Path("register", "sliding.json")  # of clouds that may slide, and of others
+FREE_MOTIONS = Path("register", "free_motions.json")  # of what slides or turns, and of others
 _PROTOCOLS = ("real", "views", "clean", "dense", "rooms")  # in the order of the tables
 _SMALL = "real", "views", "clean"  # clouds of at most 1,024 points
 # Protocols of each kind of clouds.
@@ -40,13 +40,14 @@ class TrainingRun(TypedDict):
     validation: dict[str, float]  # share of each protocol's held-out pairs within 5 degrees
 
 
-class SlidingRow(TypedDict):
-    """A row of results/register/sliding.json."""
+class FreeMotionsRow(TypedDict):
+    """A row of results/register/free_motions.json."""
 
     clouds: str
     registrations: int
     slides: int  # registrations whose source is said to slide
-    right: int | None  # of these, the right direction; None where nothing slides
+    turns: int  # registrations after which any turn about an axis is said to fit as well
+    right: int | None  # with the right direction or axis; None where nothing slides or turns
     aligned: int  # registrations that are called "aligned"
 
 
@@ -310,17 +311,19 @@ def _read_json(path: Path) -> dict[str, Any]:
     return json.loads(path.read_text())
 
 
-def sliding_table(results: Path) -> str:
-    """Build the table of what is said to slide: profiles, which do, and held-out pairs."""
-    path = results / SLIDING
+def free_motions_table(results: Path) -> str:
+    """Build the table of what is said to slide or turn: what does, and held-out pairs."""
+    path = results / FREE_MOTIONS
     if not path.is_file():
-        return "Sliding is not recorded; `benchmarks/sliding.py` measures it."
-    heads = ["clouds", "registrations", "said to slide", "in the right direction", "aligned"]
-    lines = markdown_head(heads)
+        return "Sliding and turning is not recorded; `benchmarks/free_motions.py` measures it."
+    heads = {
+        "clouds": "clouds", "registrations": "registrations", "slides": "said to slide",
+        "turns": "said to turn", "right": "in the right direction", "aligned": "aligned",
+    }  # fmt: skip
+    lines = markdown_head(list(heads.values()))
     for row in json.loads(path.read_text())["rows"]:
-        right = "" if row["right"] is None else str(row["right"])
-        counts = [str(row[name]) for name in ("registrations", "slides")]
-        lines.append(markdown_row([row["clouds"], *counts, right, str(row["aligned"])]))
+        cells = ["" if row[name] is None else str(row[name]) for name in heads]
+        lines.append(markdown_row(cells))
     return "\n".join(lines)
 
 

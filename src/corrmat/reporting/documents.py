@@ -28,9 +28,9 @@ from corrmat.reporting.comparisons import (
     doubling_summary,
     draw_training,
     families_table,
+    free_motions_table,
     large_choice_table,
     networks_table,
-    sliding_table,
 )
 from corrmat.reporting.intervals import Estimate, as_text
 from corrmat.reporting.matrices import draw_matrices
@@ -276,7 +276,7 @@ TABLES: tuple[tuple[str, str, Callable[[Results], str]], ...] = (
     ("docs/register.md", "networks", lambda results: networks_table(results.folder)),
     ("docs/register.md", "families", lambda results: families_table(results.folder)),
     ("docs/register.md", "doubling", lambda results: doubling_summary(results.folder)),
-    ("docs/register.md", "sliding", lambda results: sliding_table(results.folder)),
+    ("docs/register.md", "free_motions", lambda results: free_motions_table(results.folder)),
     ("docs/register.md", "confidence", lambda results: confidence_table(results.folder)),
     ("docs/speed.md", "bench", lambda results: bench_table(results.folder)),
 )

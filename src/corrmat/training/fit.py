@@ -110,7 +110,8 @@ def train(
         kept = last if last.is_file() else "none yet"
         kind = DivergedError if isinstance(error, DivergedError) else CorrmatError
         raise kind(f"{error}; seed {arm.settings.seed}; last good checkpoint: {kept}") from error
-    loggers.finish_loggers(lightning_loggers)
+    finally:  # else wandb would put the next arm's curve into this one's run
+        loggers.finish_loggers(lightning_loggers)
     best = folder / "best.ckpt"
     if not best.is_file():
         log.info("training ended before the first validation: the last weights count as the best")

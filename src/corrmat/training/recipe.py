@@ -39,9 +39,10 @@ _NOT_TRAINER: set[str | int] = {  # set by this project
     "enable_checkpointing", "enable_model_summary", "logger", "callbacks", "default_root_dir",
     "plugins", "profiler", "model_registry", "use_distributed_sampler", "precision",
 }  # fmt: skip
-# Options of the data that do not change its test pairs.
+# Options of the data that do not change its test pairs, or that a digest is found by.
 _NOT_TEST_PAIRS = {
-    "data", "root", "name", "batch_size", "num_workers", "train_shapes", "stretch", "new_shapes",
+    "data", "categories", "root", "name", "batch_size", "num_workers", "train_shapes", "stretch",
+    "new_shapes",
 }  # fmt: skip
 
 
@@ -388,8 +389,9 @@ def _expected_digest(
     if changed or "seed" in overrides:
         return None
     by_scale = cast(Mapping[str, Mapping[str, str]], merged.get("test_pairs") or {})
-    data = next(iter(arms.values())).data.data
-    return (by_scale.get(scale) or {}).get(data)
+    data = next(iter(arms.values())).data
+    categories = f"[{','.join(sorted(data.categories))}]" if data.categories else ""
+    return (by_scale.get(scale) or {}).get(data.data + categories)
 
 
 def _at_scale(recipe: Settings, scale: str) -> Settings:
