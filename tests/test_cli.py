@@ -350,7 +350,7 @@ def test_evaluate_tests_on_all_that_the_record_has(capsys):
         shown = capsys.readouterr().out.splitlines()
         assert set(titles) <= set(shown)
         tables = len([line for line in shown if line.endswith((" deg", " outliers"))])
-        tables += experiment == "outliers"  # the recipe's own share comes first
+        tables += name == "outliers"  # the recipe's own share comes first
         assert sum(line.startswith("rotation_error_deg_median") for line in shown) == tables == 6
 
 
