@@ -17,13 +17,14 @@ from torch import nn
 
 from corrmat.files import update_json
 from corrmat.methods import Method
+from corrmat.networks.state import load_state
 from corrmat.reporting.intervals import estimates, pair_errors
 from corrmat.reporting.writer import pair_rows
 from corrmat.revision import commit
 from corrmat.training.fit import score
 from corrmat.training.preflight import Arm, build_method, prepare
 from corrmat.training.recipe import load
-from corrmat.weights import load_model, load_state
+from corrmat.weights import load_model
 
 ROOT = Path(__file__).resolve().parents[1]
 PATH = ROOT / "results" / "batch_norm.json"

@@ -23,6 +23,7 @@ from corrmat.networks.invariant import InvariantNetwork
 from corrmat.ops import rigid
 from corrmat.progress import track
 from corrmat.registration import benchmark
+from corrmat.registration.calibrate import held_out_pairs
 from corrmat.registration.choice import (
     CHOICE_WEIGHTS,
     CandidateSearch,
@@ -31,7 +32,6 @@ from corrmat.registration.choice import (
 )
 from corrmat.registration.em_icp import em_icp
 from corrmat.registration.hypotheses import Hypotheses, NetworkHypotheses
-from corrmat.registration.shipping import held_out_pairs
 from corrmat.revision import commit
 from corrmat.types import PairBatch
 from corrmat.weights import load_model

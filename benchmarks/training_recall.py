@@ -17,7 +17,7 @@ import safetensors
 
 from corrmat.files import replace_json
 from corrmat.registration import benchmark, hypotheses
-from corrmat.registration.shipping import (
+from corrmat.registration.calibrate import (
     CALIBRATION_PAIRS,
     CALIBRATION_PROTOCOLS,
     held_out_pairs,

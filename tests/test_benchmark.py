@@ -96,20 +96,20 @@ def test_the_command_prints_one_table_and_writes_a_record(pairs, tmp_path, capsy
 
 def test_unrelated_pairs_are_spread_and_have_the_target_of_another_pair():
     pairs = benchmark.frozen_pairs("clean", points=256, count=6)
-    strangers = benchmark.unrelated(pairs, 3)
-    assert torch.equal(strangers.source, pairs.source[[0, 2, 5]])
-    assert torch.equal(strangers.target, pairs.target[[2, 4, 1]])
+    unrelated_pairs = benchmark.unrelated(pairs, 3)
+    assert torch.equal(unrelated_pairs.source, pairs.source[[0, 2, 5]])
+    assert torch.equal(unrelated_pairs.target, pairs.target[[2, 4, 1]])
     assert len(benchmark.unrelated(pairs, 9)) == 6
 
 
 def test_unrelated_clouds_are_of_different_families():
     labels = registry.load_clouds("shapes", "test").labels
     pairs = benchmark.frozen_pairs("clean", points=256)
-    strangers = benchmark.unrelated(pairs, 60)
-    is_same = (strangers.target[:, None] == pairs.target).all((2, 3))
+    unrelated_pairs = benchmark.unrelated(pairs, 60)
+    is_same = (unrelated_pairs.target[:, None] == pairs.target).all((2, 3))
     assert is_same.sum(1).tolist() == [1] * 60
     of_target = pairs.shape[is_same.int().argmax(1)]
-    assert (labels[strangers.shape] != labels[of_target]).all()
+    assert (labels[unrelated_pairs.shape] != labels[of_target]).all()
 
 
 def test_unrelated_pairs_are_counted_below_the_confidence(tmp_path):
@@ -133,8 +133,8 @@ def test_calibration_intervals_and_paired_test_by_hand():
     error = comparisons.expected_calibration_error(promised, np.array([False, True, True, True]))
     assert error == pytest.approx((0.9 + 0.1) / 4)
     # Two chances of a half: both right, or none, is an error of a half; else there is none.
-    assert comparisons.error_of_the_perfect(np.array([0.5, 0.5])) == (0, 0.5)
-    assert comparisons.error_of_the_perfect(np.ones(9)) == (0, 0)
+    assert comparisons.calibration_error_by_chance(np.array([0.5, 0.5])) == (0, 0.5)
+    assert comparisons.calibration_error_by_chance(np.ones(9)) == (0, 0)
     ours = np.array([True] * 9 + [False])
     assert comparisons._wilson(ours) == "60 to 98"
     theirs = np.array([True] * 3 + [False] * 6 + [True])

@@ -42,7 +42,7 @@ def evidence(method, method_corr, identity=90.0, bands_deg=(), curves=((), ())):
 def test_the_interval_covers_the_truth_as_often_as_it_says():
     """Of 200 samples, about 95 % have the true median within their interval."""
     truth = np.sqrt(2 * np.log(2))
-    found = [intervals.median_rotation(drawn(1.0, 80, seed)) for seed in range(200)]
+    found = [intervals.estimate_median_rotation(drawn(1.0, 80, seed)) for seed in range(200)]
     covered = np.mean([e.low <= truth <= e.high for e in found])
     assert 0.89 < covered <= 1
     assert all(e.low <= e.value <= e.high for e in found)
@@ -57,7 +57,7 @@ def test_pairs_are_resampled_together():
 
 
 def test_matches_are_shares_of_points_not_of_pairs():
-    share = intervals.match_accuracy(errors([1, 1], correct=[10, 5]))
+    share = intervals.estimate_match_accuracy(errors([1, 1], correct=[10, 5]))
     assert share.value == 0.75
 
 

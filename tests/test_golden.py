@@ -16,8 +16,8 @@ from corrmat.losses import (
 )
 from corrmat.networks import rpmnet
 from corrmat.ops import rigid
+from corrmat.reference import rename
 from corrmat.types import PairBatch
-from corrmat.weights import rename
 
 NAMES = ["dcp_identity", "dcp_transformer", "dcp_transformer_partial"]
 ULPS = 3e-7  # a relative change of the input that float32 rounding makes as well

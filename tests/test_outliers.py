@@ -162,7 +162,7 @@ def test_perfect_weights_give_the_perfect_pose():
 def test_r_precision_ranks_the_points_by_their_weight():
     weight = torch.tensor([[0.9, 0.1, 0.4, 0.2, 0.3], [0.5, 0.4, 0.3, 0.2, 0.1]])
     match = torch.tensor([[0, 5, 5, 1, -1], [0, 1, 2, 3, 4]])  # two outliers, and none
-    assert metrics.outliers_ranked(weight, match, 5).tolist() == [1, 0]  # of the two lowest, one
+    assert metrics.outliers_retrieved(weight, match, 5).tolist() == [1, 0]  # of the two lowest, one
 
 
 def test_precision_and_recall_of_the_outlier_class():

@@ -72,7 +72,7 @@ def test_every_section_is_there_and_nothing_is_fetched(results):
     assert "@import" not in page
     assert len(html) < 8e6
     assert "0 to 30 deg: correct matches, %" in html
-    assert "commit 000000000000 is not at hand" in html
+    assert "commit 000000000000 is missing" in html
     packed = re.search(r'id="plots">(.*?)</script>', html)[1]
     plots = json.loads(gzip.decompress(base64.b64decode(packed)))
     drawn = set(re.findall(r'data-plot="([^"]+)"', html))

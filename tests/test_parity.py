@@ -9,8 +9,8 @@ import torch
 from torch.testing import assert_close
 
 from corrmat.losses import ChamferLoss, CorrespondenceLoss, transformation_loss
+from corrmat.reference import rename
 from corrmat.types import PairBatch
-from corrmat.weights import rename
 
 # The released layer norm adds 1e-6 to a deviation near one; ours leaves it out.
 NAMES = {name: 1e-5 if name == "dcp_transformer" else 1e-9 for name in parity.NETWORKS}

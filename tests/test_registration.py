@@ -51,6 +51,9 @@ BROWSER = next(
 )
 
 
+POINTS_AT_HOME = np.random.default_rng(0).normal(size=(200, 3))
+
+
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory):
     """The example's two scans and their truth."""
@@ -235,7 +238,7 @@ LINE = np.arange(50.0)[:, None] * np.array([1.0, 2.0, 3.0])
         (np.hstack([GRID, 255 * GRID]), "no unit normals .one has length 1.33e.03"),
         (np.hstack([GRID, 0 * GRID]), "no unit normals .one has length 0"),
         ([[0.0, 1.0], [2.0]], "not an array of numbers"),
-        (torch.ones(9, 3, requires_grad=True), "not an array of numbers"),
+        ([["one", "two", "three"]] * 9, "not an array of numbers"),
     ],
 )
 def test_clouds_that_determine_nothing_are_refused(cloud, message):
@@ -663,7 +666,7 @@ def test_only_the_shipped_weights_have_a_calibrated_confidence(pair):
     _, source, target, _ = pair
     ways = {"model": "corrmat"}, {"model": "icp"}, {"refine": "none"}
     texts = [result.to_text(corrmat.register(source, target, **way)) for way in ways]
-    assert ["fitted to the shipped weights" in text for text in texts] == [False, True, True]
+    assert ["not calibrated" in text for text in texts] == [False, True, True]
 
 
 def test_a_printed_confidence_does_not_reach_a_verdict_that_it_has_not():
@@ -826,6 +829,18 @@ def test_a_guess_is_one_more_candidate(pair):
     assert error(guided) < 0.02 < error(guess) < error(alone)
     misled = corrmat.register(source, target, init=wrong).transform
     assert error(misled) < 0.02, "a wrong guess does not win"
+    worse = corrmat.register(source, target, model="icp", init=wrong).transform
+    assert error(worse) > 0.1, "there is no other candidate"
+
+
+def test_a_guess_of_dense_scans_that_is_right_wins():
+    """A few steps on few points take it away, and without it another candidate wins."""
+    scans = make_object_pair(5, 20_000, "val")
+    truth = rigid.to_homogeneous(scans.rotation, scans.translation)
+    alone = corrmat.register(scans.source, scans.target).transform
+    guided = corrmat.register(scans.source, scans.target, init=truth).transform
+    assert angle_deg(guided[:3, :3], scans.rotation) < 1
+    assert angle_deg(alone[:3, :3], scans.rotation) > 5
 
 
 @pytest.mark.parametrize(
@@ -842,6 +857,35 @@ def test_a_guess_that_is_not_rigid_is_refused(init, message):
     cloud = np.random.default_rng(0).normal(size=(50, 3))
     with pytest.raises(CorrmatError, match=message):
         corrmat.register(cloud, cloud, init=init)
+
+
+def test_points_are_taken_as_tensors_too():
+    points = np.random.default_rng(0).normal(size=(50, 3))
+    tensor = torch.tensor(points, dtype=torch.bfloat16, requires_grad=True)
+    expected = corrmat.register(tensor.detach().double().numpy(), points).transform
+    np.testing.assert_array_equal(corrmat.register(tensor, points).transform, expected)
+
+
+def test_a_registration_moves_points():
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(200, 3))
+    rotation = Rotation.from_rotvec([0.3, -0.5, 1.0]).as_matrix()
+    result = corrmat.register(points, points @ rotation.T + 5)
+    np.testing.assert_allclose(result.apply(points), points @ rotation.T + 5, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("cloud", "message"),
+    [
+        (np.ones((3, 50)), "transpose it"),
+        (np.full((50, 3), np.nan), "leave them out"),
+        (np.ones((50, 3), complex), "complex"),
+        ((POINTS_AT_HOME + 5e6).astype(np.float32), "have steps of 0.5, too coarse"),
+    ],
+)
+def test_a_cloud_that_cannot_be_used_says_what_to_do(cloud, message):
+    with pytest.raises(CorrmatError, match=message):
+        corrmat.register(POINTS_AT_HOME, cloud)
 
 
 def profile(rng, low, high, count):

@@ -345,13 +345,12 @@ TURN = trimesh.transformations.rotation_matrix(1.0, [1, 2, 3])
 TURN[:3, 3] = 5e6, -1, 2
 
 
-def test_a_moved_ply_keeps_all_that_it_holds(tmp_path):
-    vertices = np.zeros(
-        40, [*((n, "f4") for n in ("x", "y", "z", "nx", "ny", "nz")), ("red", "u1")]
-    )
+@pytest.mark.parametrize("normal", [("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z")])
+def test_a_moved_ply_keeps_all_that_it_holds(normal, tmp_path):
+    vertices = np.zeros(40, [*((n, "f4") for n in ("x", "y", "z", *normal)), ("red", "u1")])
     for name, column in zip("xyz", POINTS.T, strict=True):
         vertices[name] = column
-    vertices["nz"], vertices["red"] = 1, np.arange(40)
+    vertices[normal[2]], vertices["red"] = 1, np.arange(40)
     faces = np.array([([0, 1, 2],), ([3, 4, 5, 6],)], [("vertex_indices", "O")])
     elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
     PlyData(elements, text=True, comments=["TextureFile a.png"]).write(tmp_path / "scan.ply")
@@ -362,7 +361,7 @@ def test_a_moved_ply_keeps_all_that_it_holds(tmp_path):
     expected = POINTS.astype(np.float32) @ TURN[:3, :3].T + TURN[:3, 3]
     assert points.dtype == np.float64
     np.testing.assert_allclose(points, expected, rtol=1e-13)
-    normals = np.stack([moved["vertex"][name] for name in ("nx", "ny", "nz")], 1)
+    normals = np.stack([moved["vertex"][name] for name in normal], 1)
     np.testing.assert_allclose(normals, np.tile(TURN[:3, 2], (40, 1)), rtol=1e-12)
     assert (moved["vertex"]["red"] == np.arange(40)).all()
     assert [row.tolist() for row in moved["face"]["vertex_indices"]] == [[0, 1, 2], [3, 4, 5, 6]]

@@ -8,7 +8,7 @@ from corrmat import load_model, weights
 from corrmat.calibration import shipped_calibration
 from corrmat.errors import CorrmatError
 from corrmat.methods import InvariantCorr
-from corrmat.registration import shipping, verification_training
+from corrmat.registration import calibrate, shipping, verification_training
 from corrmat.registration.verification_training import train_verification
 from corrmat.weights import load_verification
 
@@ -33,10 +33,10 @@ def package(tmp_path, monkeypatch):
     copy.parent.mkdir()
     shutil.copy(weights.SHIPPED, copy)
     monkeypatch.setattr(weights, "SHIPPED", copy)
-    monkeypatch.setattr(shipping, "CALIBRATION_PAIRS", {512: 3})
-    monkeypatch.setattr(shipping, "CALIBRATION_SCANS", 2)
-    monkeypatch.setattr(shipping, "CALIBRATION_UNRELATED", 2)
-    monkeypatch.setattr(shipping, "SCAN_POINTS", 6000)
+    monkeypatch.setattr(calibrate, "CALIBRATION_PAIRS", {512: 3})
+    monkeypatch.setattr(calibrate, "CALIBRATION_SCANS", 2)
+    monkeypatch.setattr(calibrate, "CALIBRATION_UNRELATED", 2)
+    monkeypatch.setattr(calibrate, "SCAN_POINTS", 6000)
     monkeypatch.setattr("corrmat.data.shapes.dataset.SIZE", {"train": 80, "test": 10})
     monkeypatch.setattr("corrmat.data.shapes.dataset.ASSEMBLIES", {"train": 20, "test": 10})
     return copy
@@ -96,7 +96,7 @@ def test_weights_that_start_from_others_have_only_their_own_pairs(
 
 def test_a_shape_gives_one_held_out_pair_at_most(package, monkeypatch):
     monkeypatch.setattr("corrmat.data.shapes.dataset.SIZE", {"train": 1200, "test": 10})
-    pairs = shipping.held_out_pairs("clean", 10_000, seed=0, points=16)
+    pairs = calibrate.held_out_pairs("clean", 10_000, seed=0, points=16)
     assert 100 < len(pairs) == len(set(pairs.shape.tolist()))
 
 
@@ -106,7 +106,7 @@ def test_the_calibration_finds_the_chance_that_made_the_pairs():
     logit = 6 * agreement + 3 * support - 4
     right = (torch.rand(4000, generator=generator) < torch.sigmoid(logit)).double()
     scores = torch.stack([agreement, support], 1).numpy()
-    fitted = torch.tensor(shipping._fit_logistic(scores, right.numpy()))
+    fitted = torch.tensor(calibrate._fit_logistic(scores, right.numpy()))
     torch.testing.assert_close(fitted, torch.tensor([6.0, 3.0, -4.0]), rtol=0.15, atol=0)
 
 

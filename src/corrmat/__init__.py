@@ -13,11 +13,12 @@ if TYPE_CHECKING:
     from corrmat.data.scans import read_scan
     from corrmat.errors import CorrmatError
     from corrmat.ops.correspondence import SoftCorrespondence
+    from corrmat.reference import load_reference
     from corrmat.registration.pose_graph import ScanPose, register_scans
     from corrmat.registration.register import register
     from corrmat.registration.result import Registration
     from corrmat.types import PairBatch, Prediction
-    from corrmat.weights import export_model, load_model, load_reference, shipped_models
+    from corrmat.weights import export_model, load_model, shipped_models
 
 __version__ = "0.1.0"
 __all__ = [
@@ -53,7 +54,7 @@ _MODULES = {
     "SoftCorrespondence": "corrmat.ops.correspondence",
     "export_model": "corrmat.weights",
     "load_model": "corrmat.weights",
-    "load_reference": "corrmat.weights",
+    "load_reference": "corrmat.reference",
     "make_pairs": "corrmat.data.pairs",
     "read_scan": "corrmat.data.scans",
     "register": "corrmat.registration.register",

@@ -29,7 +29,7 @@ def verdict_words(confidence: float) -> Verdict:
 
 
 def as_percent(confidence: float) -> str:
-    """Format a confidence, rounded down: it never reaches a verdict that it has not."""
+    """Format a confidence, rounded down, so that it never looks like a better verdict."""
     return f"{int(100 * confidence)}%"
 
 
@@ -38,7 +38,7 @@ class Calibration:
     """Logistic curves from the scores of a registration to the chance that it is right.
 
     Coefficients are over (agreement, support, 1); over (`of_large_clouds`, 1) for large clouds; and
-    over (agreement, 1) for models without matches. `registration.shipping.calibrate` fits them.
+    over (agreement, 1) for models without matches. `registration.calibrate` fits them.
     """
 
     both: list[float]

@@ -284,8 +284,8 @@ def _register_pair(options: Namespace) -> str:
     )  # fmt: skip
     print(to_text(registration))
     if options.output is not None:
-        write_moved(options.output, options.source[0], registration.transform)
-        print(f"moved source: {options.output}")
+        kept = write_moved(options.output, options.source[0], registration.transform)
+        print(f"moved source: {options.output} ({kept})")
     content = to_json(registration, *names)
     _write_json(options.json, content)
     if options.html is not None:

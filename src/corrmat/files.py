@@ -1,10 +1,12 @@
-"""Atomic writes: a reader never sees half a file."""
+"""Atomic writes, so that a reader never sees half a file; and locks of folders."""
 
 import json
 import os
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
+
+from filelock import FileLock
 
 from corrmat.errors import CorrmatError
 
@@ -43,6 +45,12 @@ def replace_bytes(path: Path, content: bytes | memoryview) -> None:
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def folder_lock(folder: Path) -> FileLock:
+    """Return the lock that processes take before they write to a folder; it lies beside it."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    return FileLock(folder.with_name(f".{folder.name}.lock"))
 
 
 def refuse_existing(paths: Iterable[Path]) -> None:

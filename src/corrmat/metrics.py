@@ -129,7 +129,7 @@ def outlier_counts(predicted: Tensor, match: Tensor, num_target: int) -> tuple[T
     return (positive & true).sum(1), positive.sum(1), true.sum(1)
 
 
-def outliers_ranked(weight: Tensor, match: Tensor, num_target: int) -> Tensor:
+def outliers_retrieved(weight: Tensor, match: Tensor, num_target: int) -> Tensor:
     """Count the true outliers among as many points of the lowest weight.
 
     Their share of the true outliers is the precision and the recall of the threshold at which the
@@ -173,7 +173,7 @@ class RegistrationMetrics(Metric):
     """
 
     full_state_update = False
-    _OUTLIERS = "outliers_correct", "outliers_predicted", "outliers_true", "outliers_ranked"
+    _OUTLIERS = "outliers_correct", "outliers_predicted", "outliers_true", "outliers_retrieved"
     _STATE = (
         "shape", "predicted", "truth", "num_correct", "num_correct_transposed", "num_matchable",
         "chamfer_distance", *_OUTLIERS,
@@ -197,7 +197,7 @@ class RegistrationMetrics(Metric):
             if n == m and is_match(batch.match, m).all():
                 transposed = num_correct_transposed(predicted, batch.match).double()
             if c.outlier is not None:
-                ranked = outliers_ranked(c.weight(), batch.match, m)
+                ranked = outliers_retrieved(c.weight(), batch.match, m)
                 counts = *outlier_counts(predicted, batch.match, m), ranked
                 outliers = [x.double() for x in counts]
         values = {
@@ -262,7 +262,7 @@ def summary(per_pair: dict[str, Tensor]) -> dict[str, float]:
         "transposed_match_accuracy": _ratio(per_pair, "num_correct_transposed", "num_matchable"),
         "outlier_precision": _ratio(per_pair, "outliers_correct", "outliers_predicted"),
         "outlier_recall": _ratio(per_pair, "outliers_correct", "outliers_true"),
-        "outlier_r_precision": _ratio(per_pair, "outliers_ranked", "outliers_true"),
+        "outlier_r_precision": _ratio(per_pair, "outliers_retrieved", "outliers_true"),
         "chamfer": per_pair["chamfer"].mean(),
         "recall@5deg_0.05": recalled.double().mean(),
         "failed": (~angle.isfinite()).double().sum(),

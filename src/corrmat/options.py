@@ -92,6 +92,7 @@ REGISTER_EPILOG = """examples:
       every scan onto the last: all pairs are registered, and the poses that most agree on win
   corrmat register a.npy b.npy --init odometry.txt
       one scan is nearly in place: the guess is one more candidate
+      (with --model icp the only one)
   corrmat register a.npy b.npy --model ransac
       the classical pipeline instead (pip install -e '.[baselines]' in corrmat's folder)
 
@@ -350,7 +351,8 @@ def _add_register_options(parser: ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--init", type=Path, metavar="MATRIX",
-        help="a first guess, one more candidate: 4 lines of 4 numbers, or what --json wrote",
+        help="a first guess, one more candidate, or the only one of icp: 4 lines of 4 numbers, or "
+        "what --json wrote",
     )  # fmt: skip
     parser.add_argument("--seed", type=_count, default=0, help=SEED_HELP)
 

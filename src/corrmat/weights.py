@@ -7,9 +7,8 @@ weights only, which refuses every other kind of object.
 import importlib
 import json
 import pickle
-import re
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -20,81 +19,10 @@ from torch import Tensor, nn
 
 from corrmat.errors import CorrmatError
 from corrmat.files import refuse_existing, replace_bytes
-from corrmat.networks.dcp import DCPNetwork
 from corrmat.networks.invariant import InvariantNetwork
-from corrmat.networks.pcrnet import PCRNetCorrNetwork, PCRNetwork
-from corrmat.networks.rpmnet import RPMNetwork
+from corrmat.networks.state import State, load_state
 from corrmat.networks.verification import VerificationNetwork
-
-State = dict[str, Tensor]
-
-# The original authors' names to ours, rewritten in this order.
-_RULES: dict[str, tuple[tuple[str, str], ...]] = {
-    "dcp": (
-        (r"^emb_nn\.conv5\.", "embed.fuse."),
-        (r"^emb_nn\.bn5\.", "embed.norm."),
-        *((rf"^emb_nn\.conv{i + 1}\.", f"embed.edge.{i}.linear.") for i in range(4)),
-        *((rf"^emb_nn\.bn{i + 1}\.", f"embed.edge.{i}.norm.") for i in range(4)),
-        (r"^pointer\.model\.(en|de)coder\.norm\.", r"pointer.\1coder_norm."),
-        (r"^pointer\.model\.(en|de)coder\.layers\.0\.", r"pointer.\1coder."),
-        (r"self_attn\.", "self_attention."),
-        (r"src_attn\.", "cross_attention."),
-        (r"linears\.0\.", "query."),
-        (r"linears\.1\.", "key."),
-        (r"linears\.2\.", "value."),
-        (r"linears\.3\.", "out."),
-        (r"feed_forward\.w_1\.", "feedforward.0."),
-        (r"feed_forward\.w_2\.", "feedforward.2."),
-        (r"sublayer\.(\d)\.norm\.", r"norms.\1."),
-        (r"a_2$", "gain"),
-        (r"b_2$", "bias"),
-    ),
-    "rpmnet": (
-        (r"^feat_extractor\.prepool\.", "embed.edge."),
-        (r"^feat_extractor\.postpool\.6\.", "embed.out."),
-        (r"^feat_extractor\.postpool\.", "embed.point."),
-        (r"^weights_net\.prepool\.", "annealing.point."),
-        (r"^weights_net\.postpool\.", "annealing.pooled."),
-    ),
-    # PointNet's five layers: linear and ReLU, or linear, batch norm and ReLU.
-    "pcrnet": (
-        *((rf"^feature_model\.conv{i + 1}\.", f"embed.layers.{2 * i}.") for i in range(5)),
-        (r"^linear\.", "pose."),
-    ),
-    "pcrnet_corr": (
-        *((rf"^emb_nn\.conv{i + 1}\.", f"embed.layers.{3 * i}.") for i in range(5)),
-        *((rf"^emb_nn\.bn{i + 1}\.", f"embed.layers.{3 * i + 1}.") for i in range(5)),
-    ),
-}
-_IGNORED = ("head.reflect",)  # a constant of the originals' SVD head
-
-
-def load_reference(kind: str, state_dict: Mapping[str, Any], **hparams: Any) -> nn.Module:  # noqa: ANN401
-    """Build a network from the original authors' parameters.
-
-    Args:
-        kind: "dcp", "rpmnet", "pcrnet" or "pcrnet_corr".
-        state_dict: their names to tensors or arrays.
-        hparams: the original's hyper-parameters. dcp: emb_dims, n_heads, ff_dims, k, pointer.
-            rpmnet: feat_dim, num_neighbors, radius, num_iter, num_sk_iter, slack.
-            pcrnet: emb_dims, iterations. pcrnet_corr: emb_dims.
-            Sizes default to what the tensors say; `notes` and the like are ignored.
-
-    Returns:
-        The network in evaluation mode.
-
-    Raises:
-        CorrmatError: unknown kind, or the parameters do not fit; the message lists them.
-    """
-    if kind not in _BUILD:
-        raise CorrmatError(f"no reference network of kind {kind!r}; kinds: {', '.join(_BUILD)}")
-    ours = {
-        rename(kind, name): torch.as_tensor(value)
-        for name, value in state_dict.items()
-        if name not in _IGNORED
-    }
-    return load_state(_BUILD[kind](ours, hparams), ours)
-
+from corrmat.reference import kind_of, load_reference
 
 _MODEL_FILE = "model.safetensors"  # of a folder, as the Hugging Face Hub has it
 _FRONT = "---\nlibrary_name: corrmat\nlicense: mit\ntags: [point-cloud-registration]\n---\n\n"
@@ -129,9 +57,9 @@ def load_model(model: str | Path = "corrmat") -> nn.Module:
     path = Path(model)
     content = _read_checkpoint(path)
     if "method" in content:
-        return checkpoint_network(path)[2]
+        return _network_of(path, content)[2]
     state = _tensors(path, content)
-    return load_reference(_kind_of(path, state), state)
+    return load_reference(kind_of(path, state), state)
 
 
 def load_verification(matching: nn.Module) -> VerificationNetwork | None:
@@ -328,9 +256,13 @@ def checkpoint_network(path: Path) -> tuple[str, dict[str, Any], nn.Module]:
     Raises:
         CorrmatError: the method is unknown, or the parameters do not fit.
     """
+    return _network_of(path, _read_checkpoint(path))
+
+
+def _network_of(path: Path, content: Mapping[str, Any]) -> tuple[str, dict[str, Any], nn.Module]:
+    """Build the network of a checkpoint's content; see `checkpoint_network`."""
     from corrmat.methods import METHODS  # imports Lightning, which `register` does not need
 
-    content = _read_checkpoint(path)
     classes = {method.__name__: method for method in METHODS.values()}
     method = cast("str", content.get("method"))
     if method not in classes:
@@ -351,103 +283,3 @@ def checkpoint_network(path: Path) -> tuple[str, dict[str, Any], nn.Module]:
         if name.startswith("network.")
     }
     return method, hparams, load_state(network, state)
-
-
-def _kind_of(path: Path, state: State) -> str:
-    """Recognise the original authors' network by the names of its parameters."""
-    if "feat_extractor.prepool.0.weight" in state:
-        return "rpmnet"
-    if "feature_model.conv1.weight" in state:
-        return "pcrnet"
-    first = state.get("emb_nn.conv1.weight")
-    if first is not None and first.ndim > 1:
-        return "dcp" if first.shape[1] == 6 else "pcrnet_corr"
-    names = ", ".join(sorted(state)[:4])
-    raise CorrmatError(
-        f"{path} is none of DCP, RPMNet, PCRNet and PCRNet_corr; its parameters: {names}, ..."
-    )
-
-
-def rename(kind: str, name: str) -> str:
-    """Translate the name of one of the original's parameters to ours."""
-    for pattern, replacement in _RULES[kind]:
-        name = re.sub(pattern, replacement, name)
-    return name
-
-
-def _dcp(state: State, hparams: dict[str, Any]) -> nn.Module:
-    """Build DCP for a state; sizes default to the tensors'."""
-    fuse = _required(state, "embed.fuse.weight", "a DCP", "emb_nn.conv5.weight")
-    hidden = state.get("pointer.encoder.feedforward.0.weight")
-    return DCPNetwork(
-        width=hparams.get("emb_dims", len(fuse)),
-        pointer=hparams.get("pointer", "identity" if hidden is None else "transformer"),
-        heads=hparams.get("n_heads", 4),
-        feedforward=hparams.get("ff_dims", 1024 if hidden is None else len(hidden)),
-        k=hparams.get("k", 20),
-    )
-
-
-def _rpmnet(state: State, hparams: dict[str, Any]) -> nn.Module:
-    """Build RPMNet for a state; sizes default to the tensors'."""
-    out = _required(state, "embed.out.weight", "an RPMNet", "feat_extractor.postpool.6.weight")
-    iterations = hparams.get("num_iter")
-    slack = str(hparams.get("slack", "both")).split()[0]  # RPM-Net's default; a remark may follow
-    return RPMNetwork(
-        width=hparams.get("feat_dim", len(out)),
-        k=hparams.get("num_neighbors", 64),
-        radius=hparams.get("radius", 0.3),
-        iterations=iterations or 2,
-        test_iterations=iterations or 5,
-        sinkhorn_iterations=hparams.get("num_sk_iter", 5),
-        slack=slack,  # type: ignore[arg-type]
-    )
-
-
-def _pcrnet(state: State, hparams: dict[str, Any]) -> nn.Module:
-    last = _required(state, "embed.layers.8.weight", "a PCRNet", "feature_model.conv5.weight")
-    return PCRNetwork(hparams.get("emb_dims", len(last)), hparams.get("iterations", 8))
-
-
-def _pcrnet_corr(state: State, hparams: dict[str, Any]) -> nn.Module:
-    last = _required(state, "embed.layers.12.weight", "a PCRNet_corr", "emb_nn.conv5.weight")
-    return PCRNetCorrNetwork(hparams.get("emb_dims", len(last)))
-
-
-_BUILD: dict[str, Callable[[State, dict[str, Any]], nn.Module]] = {
-    "dcp": _dcp,
-    "rpmnet": _rpmnet,
-    "pcrnet": _pcrnet,
-    "pcrnet_corr": _pcrnet_corr,
-}
-
-
-def _required(state: State, name: str, what: str, theirs: str) -> Tensor:
-    if name not in state:
-        raise CorrmatError(f"not {what} checkpoint: {theirs} is missing")
-    return state[name]
-
-
-def load_state(network: nn.Module, state: State) -> nn.Module:
-    """Load a state into a network, or name every parameter that does not fit."""
-    expected = network.state_dict()
-    wrong = [f"{name} is missing" for name in expected if name not in state]
-    wrong += [f"{name} is unknown" for name in state if name not in expected]
-    wrong += [
-        f"{name} is {_shape(state[name])}, not {_shape(tensor)}"
-        for name, tensor in expected.items()
-        if name in state and _shape(state[name]) != _shape(tensor)
-    ]
-    if wrong:
-        more = f"; and {len(wrong) - 8} more" if len(wrong) > 8 else ""
-        raise CorrmatError(f"the checkpoint does not fit: {'; '.join(wrong[:8])}{more}")
-    network.load_state_dict({name: state[name].view_as(t) for name, t in expected.items()})
-    return network.eval()
-
-
-def _shape(tensor: Tensor) -> tuple[int, ...]:
-    """Drop trailing ones, by which a 1 x 1 convolution differs from a linear layer."""
-    shape = list(tensor.shape)
-    while shape and shape[-1] == 1:
-        shape.pop()
-    return tuple(shape)

@@ -7,10 +7,11 @@ from typing import TypeVar, cast
 
 import joblib
 import numpy as np
-from filelock import FileLock, Timeout
+from filelock import Timeout
 from joblib.externals.loky import get_reusable_executor
 
 from corrmat.data.clouds import finish_shards, log, missing_shards, write_shard
+from corrmat.files import folder_lock
 from corrmat.progress import track
 
 SHARD = 250  # shapes of a shard
@@ -68,12 +69,11 @@ def build_shards(
 @contextlib.contextmanager
 def _in_turn(folder: Path, title: str) -> Iterator[None]:
     """Wait until no other process makes these shapes, and keep others waiting meanwhile."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(folder.with_name(f".{folder.name}.lock"))
+    lock = folder_lock(folder)
     try:
         held = lock.acquire(timeout=0)
     except Timeout:
-        log.info(f"{title}: another process is at it; waiting")
+        log.info(f"{title}: another process makes them; waiting")
         held = lock.acquire()
     with held:
         yield

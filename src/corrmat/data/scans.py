@@ -25,6 +25,7 @@ CLOUDS = (".pcd", ".xyz", ".txt", ".csv", ".asc", ".pts", ".npy", ".npz", ".bin"
 SAMPLES = 20_000  # points taken of a mesh's surface
 _POINTS = ("points", "xyz", "pos")  # usual names of an array of points beside others
 _XYZ = {"x", "y", "z"}
+_NORMALS = ("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z")
 _MOST_COLUMNS = 32  # of an array of points: x, y, z, and whatever else was measured
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+").fullmatch
 _FACES = re.compile(rb"^element (face|tristrips) +[1-9]", re.MULTILINE)
@@ -110,7 +111,7 @@ def read_shape(path: Path) -> "np.ndarray | trimesh.Trimesh":
     return points
 
 
-def write_moved(path: Path, scan: Path, transform: np.ndarray) -> None:
+def write_moved(path: Path, scan: Path, transform: np.ndarray) -> str:
     """Write a scan, moved by a rigid transform, as a binary PLY with coordinates in doubles.
 
     A PLY file keeps its faces, its colours and whatever else it holds; its normals turn with it.
@@ -120,6 +121,10 @@ def write_moved(path: Path, scan: Path, transform: np.ndarray) -> None:
         path: to write.
         scan: the file to move, as `read_scan` takes it.
         transform: (4, 4) float64.
+
+    Returns:
+        What was written, for people: "with all that the PLY holds", "vertices and faces alone" or
+        "points alone".
 
     Raises:
         CorrmatError: there is no folder to write into, or see `read_scan`.
@@ -134,18 +139,19 @@ def write_moved(path: Path, scan: Path, transform: np.ndarray) -> None:
             written = io.BytesIO()
             content.write(written)
             _replace(path, written.getbuffer())
-            return
+            return "with all that the PLY holds"
     shape = read_shape(scan)
     points, faces = (
         (shape, None) if isinstance(shape, np.ndarray) else (shape.vertices, shape.faces)
     )
     write_ply(path, points @ transform[:3, :3].T + transform[:3, 3], faces)
+    return "points alone" if faces is None else "vertices and faces alone"
 
 
 def _move_vertices(vertices: "plyfile.PlyElement", transform: np.ndarray) -> None:
     """Move the vertices of a PLY file and turn their normals; both become doubles."""
     rotation, translation = transform[:3, :3], transform[:3, 3]
-    for names, shift in (("xyz", translation), (("nx", "ny", "nz"), 0.0)):
+    for names, shift in (("xyz", translation), *((names, 0.0) for names in _NORMALS)):
         if fields := _fields(vertices, names):
             moved = _stack(vertices, fields) @ rotation.T + shift
             for field in fields:

@@ -1,4 +1,4 @@
-"""The network that verifies hypotheses: does a transform put two clouds on each other rightly?
+"""The network that verifies hypotheses: does a transform align two clouds correctly?
 
 Single numbers, such as how near the clouds' points are, prefer many a wrong pose to the right one:
 half a chair lies well on the other half turned over. This network looks at every point under the

@@ -24,7 +24,7 @@ from corrmat.registration.verification import verify
 
 
 class ChoiceWeights(NamedTuple):
-    """A candidate scores its agreement + these times what the fields name.
+    """Weights of a candidate's score: its agreement plus the weighted sum of the other measures.
 
     All but the last are in the order of the measures' columns, whose first is the agreement.
     """
@@ -114,6 +114,7 @@ class CandidateSearch:
     def __init__(self, hypotheses: Hypotheses, clouds: PreparedClouds) -> None:
         self.hypotheses, self.clouds = hypotheses, clouds
         self._scorer = clouds.scorers[0]
+        self._guesses = np.empty((0, 4, 4))
 
     @classmethod
     def start(
@@ -127,10 +128,15 @@ class CandidateSearch:
         clouds = prepare_clouds(source, target, seed)
         return cls(generate(*clouds.subsamples, seed), clouds)
 
-    def add(self, transform: np.ndarray) -> None:
-        """Add a transform (4, 4) of the user's coordinates to the hypotheses."""
-        given = self.clouds.from_original_units(transform)
-        transforms = np.concatenate([self.hypotheses.transforms, given[None]])
+    def add_guess(self, transform: np.ndarray, *, alone: bool) -> None:
+        """Add a guess (4, 4), in the user's coordinates, to the hypotheses, or in their place.
+
+        It may be right already, and the few steps on few points that other hypotheses get would
+        take it away. So it is a candidate as it is, too, and refined on more points.
+        """
+        self._guesses = self.clouds.from_original_units(transform)[None]
+        others = self.hypotheses.transforms[: 0 if alone else None]
+        transforms = np.concatenate([others, self._guesses])
         self.hypotheses = self.hypotheses._replace(transforms=transforms)
 
     @property
@@ -181,6 +187,9 @@ class CandidateSearch:
             peaks = correlation.peaks(transforms[:, :3, :3], PEAKS)
             transforms = np.concatenate([transforms, peaks])
         refined = self.refine_a_little(transforms)
+        if len(self._guesses):
+            from_guesses = np.stack([self._scorer.refine(each) for each in self._guesses])
+            refined = distinct(np.concatenate([from_guesses, self._guesses, refined]))
         measures = self.measure(refined)
         if not half_turns:
             return refined, measures

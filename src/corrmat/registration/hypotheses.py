@@ -1,4 +1,4 @@
-"""Hypotheses of how two clouds lie to each other: from the network, and from classical pipelines.
+"""Candidate transforms between two clouds, from the network and from classical pipelines.
 
 All generators have one signature, and `register` refines, scores and selects their hypotheses in
 the same way. Lengths are in units in which a cloud's radius is about one.

@@ -15,6 +15,7 @@ MEDIAN = 0.6  # median distance from the centroid after scaling: a radius of abo
 NORMAL_TOLERANCE = 0.01  # by which the length of a given normal may differ from one
 RIGID_TOLERANCE = 0.01  # by which the rotation of a given transform may differ from one
 FAR = 30.0  # median distances from the middle: a point beyond is a stray one and left out
+COARSE = 0.05  # median distances: a cloud whose coordinates have larger steps is damaged
 _LINE = 1e-6  # a cloud that is thinner, relative to its length, is a line
 
 
@@ -44,18 +45,29 @@ class Cloud:
             raise CorrmatError(f"{name}: points are needed; corrmat.read_scan reads a file")
         if isinstance(cloud, np.ma.MaskedArray):
             raise CorrmatError(f"{name}: a masked array; pass the rows that count, or fill it")
+        detach = getattr(cloud, "detach", None)  # a tensor of torch, maybe on a GPU
+        if detach is not None:
+            cloud = detach().cpu().double().numpy()
         try:
-            values = np.asarray(cloud, np.float64)
+            given = np.asarray(cloud)
+            if np.iscomplexobj(given):
+                raise TypeError("complex numbers")
+            values = given.astype(np.float64, copy=False)
         except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError is torch's
             raise CorrmatError(f"{name}: not an array of numbers ({error})") from error
         if values.ndim != 2 or values.shape[1] not in (3, 6):
-            raise CorrmatError(f"{name}: array of shape {values.shape}, not (N, 3) or (N, 6)")
+            wide = values.ndim == 2 and values.shape[0] in (3, 6)
+            remedy = "; transpose it" if wide else ""
+            raise CorrmatError(
+                f"{name}: array of shape {values.shape}, not (N, 3) or (N, 6){remedy}"
+            )
         if len(values) < 3:
             raise CorrmatError(f"{name}: {len(values)} points; a rotation needs at least 3")
         bad = np.flatnonzero(~np.isfinite(values).all(1))
         if len(bad):
             raise CorrmatError(
-                f"{name}: {len(bad)} points are NaN or infinite, the first is row {bad[0]}"
+                f"{name}: {len(bad)} points are NaN or infinite, the first is row {bad[0]}; leave "
+                "them out: points[np.isfinite(points).all(1)]"
             )
         lengths = np.linalg.norm(values[:, 3:], axis=1)
         if values.shape[1] > 3 and np.abs(lengths - 1).max() > NORMAL_TOLERANCE:
@@ -84,6 +96,12 @@ class Cloud:
         if breadth <= max(_LINE * length, noise):
             raise CorrmatError(
                 f"{name}: all points lie on one line; the rotation is not determined"
+            )
+        step = float(np.spacing(np.abs(checked.values[:, :3]).max().astype(np.float32)))
+        if step > COARSE * checked.median and _is_float32(checked.values[:, :3]):
+            raise CorrmatError(
+                f"{name}: so far from the origin its float32 coordinates have steps of {step:.2g}, "
+                "too coarse for its size; export doubles, or subtract an offset before"
             )
         return checked
 
@@ -172,6 +190,11 @@ def is_near(points: np.ndarray, different: np.ndarray, name: str = "cloud") -> n
         size = "small" if typical == 0 else "large"
         raise CorrmatError(f"{name}: coordinates are too {size} to compute distances")
     return distance <= FAR * typical
+
+
+def _is_float32(values: np.ndarray) -> bool:
+    """Tell whether numbers were stored in single precision."""
+    return bool((values == values.astype(np.float32)).all())
 
 
 def _hash(values: np.ndarray, seed: int) -> np.ndarray:

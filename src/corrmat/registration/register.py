@@ -48,7 +48,8 @@ def register(
         refine: "icp": generalised ICP of all candidates of the model, then EM-ICP of the best, or
             generalised ICP on more and more points where both clouds have more than 2,048; or
             "none": the candidates as they are.
-        init: (4, 4), a guess of the transform, such as an odometry's: one more candidate.
+        init: (4, 4), a guess of the transform, such as an odometry's: one more candidate, or with
+            model="icp" the only one.
         seed: of subsampling and of the model's random draws.
 
     Returns:
@@ -72,7 +73,7 @@ def register(
     start = time.perf_counter()
     search = CandidateSearch.start(generate, source, target, seed)
     if guess is not None:
-        search.add(guess)
+        search.add_guess(guess, alone=model == "icp")
     hypotheses, clouds = search.hypotheses, search.clouds
     if refine == "icp":
         candidates, measures = search.find(half_turns=hypotheses.verification is not None)
@@ -141,7 +142,9 @@ def _reason(
         reasons.append(f"a cloud has only {fewest} points")
     if max(size, 1 / size) > OTHER_SIZE:
         times = f"{max(size, 1 / size):,.0f} times as large"
-        reasons.append(f"one cloud is {times} as the other: do both have the same unit?")
+        reasons.append(
+            f"one cloud is {times} as the other: do both have the same unit, or is it a part?"
+        )
     return ", ".join(reasons)
 
 

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from corrmat.calibration import as_percent
 from corrmat.errors import CorrmatError
+from corrmat.ops import rigid
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -41,6 +42,10 @@ class Registration:
             f"rotation_deg={self.rotation_deg:.2f}, model={self.model!r})"
         )
 
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        """Move points (N, 3) of the source's frame onto the target: (N, 3)."""
+        return rigid.move(self.transform, np.asarray(points, np.float64))
+
     @property
     def rotation_deg(self) -> float:
         """The rotation's angle."""
@@ -54,7 +59,7 @@ def to_text(registration: Registration) -> str:
         "matrix (target = matrix @ source):",
         *matrix_lines(registration.transform),
         f"rotation     {registration.rotation_deg:.3f} deg",
-        f"translation  {x:.6g} {y:.6g} {z:.6g}",
+        f"translation  {x:.10g} {y:.10g} {z:.10g}",
         f"overlap      {registration.overlap:.1%} of the source has a target point near",
         f"RMSE         {registration.rmse:.6g} between these points"
         if registration.overlap
@@ -98,7 +103,7 @@ def direction_text(direction: np.ndarray) -> str:
 
 def note_on_confidence(calibrated: bool) -> str:
     """Say which confidence was not fitted to its model and refinement."""
-    return "" if calibrated else "  (fitted to the shipped weights with ICP, not to these options)"
+    return "" if calibrated else "  (not calibrated: it was fitted to model corrmat with ICP)"
 
 
 def matrix_lines(transform: np.ndarray) -> list[str]:

@@ -18,8 +18,8 @@ from corrmat.reporting.intervals import (
     Estimate,
     PairErrors,
     as_text,
-    match_accuracy,
-    median_rotation,
+    estimate_match_accuracy,
+    estimate_median_rotation,
     p_of_equal_errors,
     ratio_of_medians,
     read_errors,
@@ -57,6 +57,7 @@ class Claim:
     where: str
     verdict: Verdict
     kind: Kind = "other claims"
+    verdict_by_paper_metric: Verdict | None = None  # of "registers better"; without an interval
 
     @property
     def scale(self) -> str:
@@ -123,9 +124,12 @@ def less_error(evidence: Evidence) -> Claim:
     learnt = evidence.left_identity(evidence.baseline)
     theirs = by_paper_metric(record, record.paper)
     paper_ratio = arm_ratio(theirs)
+    by_paper = arm_ratio(by_paper_metric(record, record.arms))
     p = p_of_equal_errors(evidence.baseline, evidence.treatment)
     flips = evidence.baseline.flipped, evidence.treatment.flipped
-    arms = [as_text(median_rotation(e), "deg") for e in (evidence.baseline, evidence.treatment)]
+    arms = [
+        as_text(estimate_median_rotation(e), "deg") for e in (evidence.baseline, evidence.treatment)
+    ]
     ours = f"{arms[0]} → {arms[1]}: {as_text(ratio)} times"
     ours += f" (p {_p_text(p)}; flips {flips[0]} → {flips[1]})"
     if not learnt:
@@ -138,6 +142,9 @@ def less_error(evidence: Evidence) -> Claim:
         evidence.record.trained_on,
         verdict_of_ratio(ratio, paper_ratio, learnt),
         "registers better",
+        None
+        if by_paper is None
+        else verdict_of_ratio(Estimate(by_paper, by_paper, by_paper), paper_ratio, learnt),
     )
 
 
@@ -154,7 +161,9 @@ def by_paper_metric(record: Record, results: Mapping[str, ArmResult]) -> list[fl
 def headline(evidence: Evidence) -> list[str]:
     """Return the cells of README's table: what both arms reached, and the verdict."""
     record = evidence.record
-    arms = [as_text(median_rotation(e), "deg") for e in (evidence.baseline, evidence.treatment)]
+    arms = [
+        as_text(estimate_median_rotation(e), "deg") for e in (evidence.baseline, evidence.treatment)
+    ]
     judged = less_error(evidence)
     pairs = record.arms[record.treatment].pairs_seen
     ransac = evidence.errors.get("ransac")
@@ -258,8 +267,8 @@ def loss_not_rate(evidence: Evidence) -> Claim | None:
     return Claim(
         f"{record.id}: RPMNet_corr registers better than RPMNet at a high rate",
         "(RPMNet was unstable at high rates)",
-        f"{as_text(median_rotation(evidence.errors[control]), 'deg')} → "
-        f"{as_text(median_rotation(evidence.treatment), 'deg')}: {as_text(ratio)} times",
+        f"{as_text(estimate_median_rotation(evidence.errors[control]), 'deg')} → "
+        f"{as_text(estimate_median_rotation(evidence.treatment), 'deg')}: {as_text(ratio)} times",
         evidence.record.trained_on,
         verdict_of_ratio(ratio, None, evidence.left_identity(evidence.errors[control])),
     )
@@ -291,7 +300,9 @@ def matches_say_more(evidence: Evidence) -> Claim | None:
     control = _high_rate_control(evidence.record)
     if control is None:
         return None
-    fewer, more = (match_accuracy(e) for e in (evidence.errors[control], evidence.treatment))
+    fewer, more = (
+        estimate_match_accuracy(e) for e in (evidence.errors[control], evidence.treatment)
+    )
     ratio = ratio_of_medians(evidence.errors[control], evidence.treatment)
     alike = ratio.low >= 1 / ALIKE and ratio.high <= ALIKE
     apart = more.low - fewer.high >= APART
@@ -310,7 +321,7 @@ def _high_rate_control(record: Record) -> str | None:
 
 def below_seventy_per_cent(evidence: Evidence) -> Claim | None:
     """PCRNet_corr "could not achieve" 70 % of correct matches on 1024 points."""
-    share, record = match_accuracy(evidence.treatment), evidence.record
+    share, record = estimate_match_accuracy(evidence.treatment), evidence.record
     curve = record.arms[record.treatment].curve
     if len(curve) < 4:  # too few to tell whether it still learns
         return None
@@ -381,7 +392,7 @@ def claims_of(records: Sequence[Record], results: Path) -> list[Claim]:
     judged = [
         claim for record in records if record.scale != "smoke" for claim in _judge(record, results)
     ]
-    return judged + figure_2(results)
+    return sorted(judged, key=lambda claim: claim.words) + figure_2(results)
 
 
 def _judge(record: Record, results: Path) -> list[Claim]:
@@ -417,6 +428,22 @@ def summarise_claims(claims: Sequence[Claim]) -> str:
         ]
         lines.append(markdown_row([words, *cells]))
     return "\n".join(lines)
+
+
+def other_verdicts_by_paper_metric(claims: Sequence[Claim]) -> str:
+    """Say which verdicts on "registers better" would differ by the paper's own metric."""
+    judged = [claim for claim in claims if claim.verdict_by_paper_metric]
+    others = [claim for claim in judged if claim.verdict != claim.verdict_by_paper_metric]
+    each = "; ".join(
+        f"{claim.words.partition(':')[0]} ({claim.where}) {claim.verdict_by_paper_metric} instead "
+        f"of {claim.verdict}"
+        for claim in others
+    )
+    return (
+        "By the paper's own metrics, means and root mean squares without intervals, "
+        f"{len(others)} of the {len(judged)} verdicts on *registers better* would differ"
+        f"{': ' if others else ''}{each}."
+    )
 
 
 def verdicts(record: Record, results: Path) -> str:

@@ -210,12 +210,12 @@ def confidence_table(results: Path) -> str:
             promised, aligned = map(np.concatenate, zip(*both, strict=True))
             error = expected_calibration_error(promised, aligned)
             text = f"expected calibration error over {_BINS} bins {error:.3f}"
-            low, high = error_of_the_perfect(promised)
+            low, high = calibration_error_by_chance(promised)
             perfect = f"a perfect confidence would show {low:.3f} to {high:.3f} on so many"
             summaries += ["", f"{len(promised)} pairs of {what}: {text} ({perfect})."]
-        strangers = [result for protocol, result in unrelated if protocol in protocols]
-        if strangers:
-            confidence = np.concatenate([_confidence(result) for result in strangers])
+        of_unrelated = [result for protocol, result in unrelated if protocol in protocols]
+        if of_unrelated:
+            confidence = np.concatenate([_confidence(result) for result in of_unrelated])
             verdicts = _verdicts(confidence).tolist()
             counts = ", ".join(f"{verdicts.count(words)} {words}" for words in get_args(Verdict))
             summaries += ["", f"{len(verdicts)} unrelated pairs of {what}: {counts}."]
@@ -234,8 +234,8 @@ def expected_calibration_error(promised: np.ndarray, happened: np.ndarray) -> fl
     return float(sum(gaps) / len(promised))
 
 
-def error_of_the_perfect(promised: np.ndarray) -> tuple[float, float]:
-    """Compute the calibration error that chance alone gives chances (n,) which are all true.
+def calibration_error_by_chance(promised: np.ndarray) -> tuple[float, float]:
+    """Compute the calibration error that a perfect confidence (n,) shows by chance.
 
     Returns:
         Its 90 % interval.

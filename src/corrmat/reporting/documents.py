@@ -16,7 +16,9 @@ from corrmat.reporting.claims import (
     claims_of,
     count_verdicts,
     headline,
+    less_error,
     markdown_claims,
+    other_verdicts_by_paper_metric,
     read_evidence,
     summarise_claims,
 )
@@ -99,15 +101,21 @@ def headline_table(results: Results) -> str:
         [arm_ratio(by_paper_metric(record, of)) or math.nan for of in (record.arms, record.paper)]
         for record in records
     ]
+    learnt = [less_error(read_evidence(r, results.folder)).verdict != "not shown" for r in records]
     ahead = sum(ours > 1 for ours, _ in ratios)
-    near = sum(ours >= NEAR_PAPER * theirs for ours, theirs in ratios)
+    near = sum(
+        ours >= NEAR_PAPER * theirs
+        for (ours, theirs), shown in zip(ratios, learnt, strict=True)
+        if shown
+    )
     counted = count_verdicts(results.claims)
     return "\n".join(
         [
             *lines,
             "",
             f"By the paper's metric METHOD_corr is ahead in {ahead} of these {len(ratios)} "
-            f"experiments, and in {near} by at least half of the paper's ratio.",
+            f"experiments, and in {near} of the {sum(learnt)} in which METHOD learnt by at least "
+            "half of the paper's ratio.",
             f"All verdicts of [docs/claims.md](docs/claims.md): {counted}.",
         ]
     )
@@ -269,6 +277,11 @@ TABLES: tuple[tuple[str, str, Callable[[Results], str]], ...] = (
     ("docs/reproduction.md", "seeds", seeds_table),
     ("docs/metrics.md", "tables", lambda results: markdown_tables(results.records)),
     ("docs/claims.md", "summary", lambda results: summarise_claims(results.claims)),
+    (
+        "docs/claims.md",
+        "by-paper-metric",
+        lambda results: other_verdicts_by_paper_metric(results.claims),
+    ),
     ("docs/claims.md", "claims", lambda results: markdown_claims(results.claims)),
     ("docs/register.md", "comparison", lambda results: comparison_table(results.folder)),
     ("docs/register.md", "choice", lambda results: choice_table(results.folder)),

@@ -14,7 +14,7 @@ from matplotlib.ticker import EngFormatter, LogFormatter, NullFormatter
 
 from corrmat.files import replace_bytes
 from corrmat.reporting.record import ArmResult, Record, Subset, defined
-from corrmat.reporting.snapshots import PairSnapshot, SnapshotStep, Stage, match_accuracy, stages
+from corrmat.reporting.snapshots import PairSnapshot, SnapshotStep, Stage, stages
 from corrmat.reporting.tables import METRICS, MISPRINTS
 
 # The columns of the paper's figures 5, 6 and 7, by family.
@@ -263,7 +263,7 @@ def draw_matches(
     """
     view = principal_axes(np.asarray(snapshot.target))
     before, *_, after = stages(_turned(snapshot, view))
-    right = f"{100 * match_accuracy(snapshot):.0f} % of the matches are right"
+    right = f"{100 * snapshot.match_accuracy:.0f} % of the matches are right"
     scenes = [(f"{snapshot.arm}: {right}", before, True)]
     if baseline is not None:
         moved, shape = (

@@ -13,6 +13,7 @@ import numpy as np
 from scipy import stats
 
 RESAMPLES = 2000
+_LARGE = 10_000  # a ratio above it says that one error is of rounding alone
 FLIPPED_DEG = 90.0  # a larger rotation error is a flip, not an inaccuracy
 
 
@@ -57,6 +58,8 @@ def as_text(estimate: Estimate, unit: str = "") -> str:
     """Format an estimate with its interval."""
     factor = 100 if unit == "%" else 1
     value, low, high = (factor * x for x in (estimate.value, estimate.low, estimate.high))
+    if low > _LARGE:
+        return f"more than {_LARGE:,}"
     return f"{value:.3g} [{low:.3g}, {high:.3g}]" + (f" {unit}" if unit else "")
 
 
@@ -84,12 +87,12 @@ def pair_errors(rows: Sequence[Mapping[str, object]]) -> PairErrors:
     )
 
 
-def median_rotation(errors: PairErrors) -> Estimate:
+def estimate_median_rotation(errors: PairErrors) -> Estimate:
     """Estimate the median rotation error, in degrees."""
     return _bootstrap([errors.rotation_deg], _median)
 
 
-def match_accuracy(errors: PairErrors) -> Estimate:
+def estimate_match_accuracy(errors: PairErrors) -> Estimate:
     """Estimate the share of matchable source points whose match is correct."""
     counts = [errors.num_correct, errors.num_matchable]
     return _bootstrap(counts, lambda correct, matchable: correct.sum(-1) / matchable.sum(-1))
@@ -97,7 +100,10 @@ def match_accuracy(errors: PairErrors) -> Estimate:
 
 def estimates(errors: PairErrors) -> dict[str, dict[str, float]]:
     """Estimate the median rotation error and the share of correct matches, for a JSON file."""
-    both = {"median_deg": median_rotation(errors), "match_accuracy": match_accuracy(errors)}
+    both = {
+        "median_deg": estimate_median_rotation(errors),
+        "match_accuracy": estimate_match_accuracy(errors),
+    }
     return {name: asdict(estimate) for name, estimate in both.items()}
 
 

@@ -57,9 +57,9 @@ def staleness(record: Record, repository: Path) -> str:
         try:
             diff = git(repository, "diff", "--name-only", "--relative", name, "--", *code)
         except OSError:
-            return "git is not at hand, so nobody can tell whether the code has changed"
+            return "git is missing: nobody can tell whether the code has changed"
         if diff.returncode:
-            return f"commit {name} is not at hand, so nobody can tell whether the code has changed"
+            return f"commit {name} is missing: nobody can tell whether the code has changed"
         for path in diff.stdout.split():
             then, now = _text_at(repository, name, path), repository / path
             if then is None or not now.exists():

@@ -36,6 +36,13 @@ class PairSnapshot:
     steps: list[SnapshotStep]
     clean: Points  # (P, 3) of the whole shape, in the source's frame
 
+    @property
+    def match_accuracy(self) -> float:
+        """Share of the inliers whose predicted match is right."""
+        match, matched = np.asarray(self.match), np.asarray(self.steps[-1].matched)
+        inlier = (match >= 0) & (match < len(self.target))
+        return float((matched == match)[inlier].mean())
+
     @staticmethod
     def from_json(content: Mapping[str, object]) -> "PairSnapshot":
         """Read an entry of snapshots.json."""
@@ -109,13 +116,6 @@ def stages(snapshot: PairSnapshot) -> list[Stage]:
         matched = np.asarray(step.matched)
         scenes.append(Stage(f"iteration {number}", moved, y, matched, matched == match, shape))
     return scenes
-
-
-def match_accuracy(snapshot: PairSnapshot) -> float:
-    """Compute the share of inliers whose predicted match is right."""
-    match, matched = np.asarray(snapshot.match), np.asarray(snapshot.steps[-1].matched)
-    inlier = (match >= 0) & (match < len(snapshot.target))
-    return float((matched == match)[inlier].mean())
 
 
 def thin(points: np.ndarray, count: int) -> np.ndarray:

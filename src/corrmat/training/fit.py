@@ -16,6 +16,7 @@ from corrmat.data.datamodule import PairDataset
 from corrmat.errors import CorrmatError, DivergedError, cannot_write, short_message
 from corrmat.methods import Method
 from corrmat.module import RegistrationModule
+from corrmat.networks.state import load_state
 from corrmat.revision import commit
 from corrmat.training import loggers, runs
 from corrmat.training.callbacks import (
@@ -37,7 +38,7 @@ from corrmat.training.hardware import (
 from corrmat.training.preflight import Arm, build_method, planned_steps
 from corrmat.training.recipe import ArmSettings
 from corrmat.training.runs import TrainedArm
-from corrmat.weights import load_model, load_state
+from corrmat.weights import load_model
 
 log = logging.getLogger("corrmat")
 _TIMED_STEPS = 3

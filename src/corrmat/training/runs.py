@@ -11,12 +11,12 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
-import filelock
 import torch
 import yaml
+from filelock import Timeout
 
 from corrmat.errors import CorrmatError
-from corrmat.files import replace_json, replace_text
+from corrmat.files import folder_lock, replace_json, replace_text
 from corrmat.reporting.record import COMMIT_SEPARATOR
 from corrmat.training.hardware import is_first_process
 from corrmat.training.preflight import Arm
@@ -54,19 +54,18 @@ def arm_folders(recipe: Recipe, arm: str, runs: Path) -> list[Path]:
 
 @contextlib.contextmanager
 def only_process(folder: Path) -> Iterator[None]:
-    """Keep other processes from training into a folder meanwhile; those of one training share it.
+    """Keep other trainings out of a folder; the processes of one distributed training share it.
 
     Raises:
-        CorrmatError: another process is at it.
+        CorrmatError: another training writes to it.
     """
     if not is_first_process():
         yield
         return
-    folder.parent.mkdir(parents=True, exist_ok=True)
     try:
-        with filelock.FileLock(folder.with_name(f".{folder.name}.lock"), timeout=0):
+        with folder_lock(folder).acquire(timeout=0):
             yield
-    except filelock.Timeout as error:
+    except Timeout as error:
         raise CorrmatError(
             f"another process trains into {folder}; wait for it, or name another folder: --runs"
         ) from error
