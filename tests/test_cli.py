@@ -164,6 +164,8 @@ def test_corrmat_alone_says_what_it_can_do(capsys):
     [
         (["evaluate", *FIT[1:], "--record", "x.json"], "nrecognized arguments: --record"),
         (["compare", "icp", "--config", "x.yaml"], "nrecognized arguments: --config"),
+        (["compare", "icp", "--protoco", "real"], "nrecognized arguments: --protoco"),
+        ([*FIT, "--trainer.max_step", "5"], "nrecognized arguments: --trainer.max_step"),
         (["compare", ","], "which models?"),
         (["compare", "icp", "--keep", "1"], "nrecognized arguments: --keep"),
         (["compare", "icp", "--record", "file/x.json"], "cannot write to file"),

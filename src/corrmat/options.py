@@ -181,6 +181,7 @@ def build_parser(with_settings: Sequence[str] = ()) -> ArgumentParser:
         epilog=EPILOG,
         formatter_class=raw,
         exit_on_error=False,
+        allow_abbrev=False,  # a typo is not a choice
     )
     commands = parser.add_subcommands(dest="command", metavar="command")
 
