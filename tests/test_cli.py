@@ -304,6 +304,14 @@ def test_help_says_what_an_option_is_by_default(command, default, capsys):
     assert f"(default: {default})" in " ".join(capsys.readouterr().out.split())
 
 
+def test_help_says_the_type_of_a_setting_and_its_default(capsys):
+    with pytest.raises(SystemExit, match="0"):
+        main(["fit", "--help"])
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "peak of a one-cycle schedule. (type: float, default: 0.001)" in shown
+    assert "(type: <class" not in shown
+
+
 def test_help_of_a_script_says_what_the_script_does():
     words = [sys.executable, ROOT / "reproduce" / "checkpoints.py", "--help"]
     shown = subprocess.run(words, capture_output=True, text=True).stdout

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from jsonargparse import ArgumentParser, Namespace
+from jsonargparse import ArgumentParser, DefaultHelpFormatter, Namespace
 
 from corrmat import __version__
 from corrmat.errors import CorrmatError, short_message
@@ -114,6 +114,14 @@ SEED_HELP = f"seed of the random draws {DEFAULT}"
 EXPERIMENT_COMMANDS = ("run", "fit", "evaluate")
 
 
+class HelpFormatter(DefaultHelpFormatter, argparse.RawDescriptionHelpFormatter):
+    """Add to every setting of a recipe its type, and its default where no recipe says another."""
+
+    def _get_help_string(self, action: argparse.Action) -> str:
+        is_setting = "." in action.dest
+        return super()._get_help_string(action) if is_setting else action.help or ""
+
+
 def parse(words: Sequence[str]) -> Namespace:
     """Parse a command line.
 
@@ -173,13 +181,12 @@ def build_parser(with_settings: Sequence[str] = ()) -> ArgumentParser:
     Args:
         with_settings: commands that get the typed settings of recipes, whose import takes seconds.
     """
-    raw = argparse.RawDescriptionHelpFormatter
     parser = ArgumentParser(
         prog="corrmat",
         version=__version__,
         description="Correspondence Matrices are Underrated (3DV 2020), reproduced.",
         epilog=EPILOG,
-        formatter_class=raw,
+        formatter_class=HelpFormatter,
         exit_on_error=False,
         allow_abbrev=False,  # a typo is not a choice
     )
@@ -189,7 +196,8 @@ def build_parser(with_settings: Sequence[str] = ()) -> ArgumentParser:
         """Add a command; `words` are those that its usage names before the options."""
         usage = " ".join(["corrmat", name, *words.split(), "[options]"])
         command = ArgumentParser(
-            description=purpose, epilog=epilog, formatter_class=raw, exit_on_error=False,
+            description=purpose, epilog=epilog, formatter_class=HelpFormatter,
+            exit_on_error=False,
             usage=usage,
         )  # fmt: skip
         commands.add_subcommand(name, command, help=purpose)
