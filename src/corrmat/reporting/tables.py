@@ -48,7 +48,8 @@ def paper_metric(record: Record) -> str:
 def table(record: Record) -> tuple[list[str], list[list[str]]]:
     """Build the table of ours beside the paper's: headings, and a row a metric (and subset)."""
     heads = ["", *record.arms, "ratio", *record.baselines]
-    heads += [*(f"paper {arm}" for arm in record.as_printed), "paper ratio"]
+    heads += [f"paper {arm}" for arm in record.as_printed]
+    heads += ["paper ratio"] if record.paper else []
     groups = record.arms, record.baselines, record.as_printed
     rows = [
         row
@@ -90,7 +91,8 @@ def _row_of(
     by_arm = dict(zip(record.arms, ours, strict=True))
     ratio_of_arms = ratio_cell([by_arm[arm] for arm in record.compared])
     texts = [[cell(value, name) for value in group] for group in (ours, others, theirs)]
-    return [heading, *texts[0], ratio_of_arms, *texts[1], *texts[2], ratio_cell(theirs)]
+    row = [heading, *texts[0], ratio_of_arms, *texts[1], *texts[2]]
+    return [*row, ratio_cell(theirs)] if record.paper else row
 
 
 def terminal_table(record: Record) -> str:
@@ -105,7 +107,8 @@ def terminal_table(record: Record) -> str:
 
     num_pairs = int(next(iter(record.arms.values())).metrics["pairs"])
     title = f"{record.id}  {record.title}  ({record.scale}, {record.data}, {num_pairs} test pairs)"
-    lines = ["", title, effort(record), "", line(heads), "-" * len(line(heads))]
+    compared = f"ratio: {' / '.join(record.compared)}" if len(record.compared) > 1 else ""
+    lines = ["", title, effort(record), compared, "", line(heads), "-" * len(line(heads))]
     return "\n".join([*lines, *map(line, rows), ""])
 
 
