@@ -343,6 +343,7 @@ def test_a_ply_may_name_its_axes_in_capitals(tmp_path):
 
 TURN = trimesh.transformations.rotation_matrix(1.0, [1, 2, 3])
 TURN[:3, 3] = 5e6, -1, 2
+COLOURS = "red", "green", "blue"
 
 
 @pytest.mark.parametrize("normal", [("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z")])
@@ -366,6 +367,23 @@ def test_a_moved_ply_keeps_all_that_it_holds(normal, tmp_path):
     assert (moved["vertex"]["red"] == np.arange(40)).all()
     assert [row.tolist() for row in moved["face"]["vertex_indices"]] == [[0, 1, 2], [3, 4, 5, 6]]
     assert moved.comments == ["TextureFile a.png"]
+
+
+def test_a_moved_pcd_keeps_its_colours(tmp_path):
+    from pypcd4 import PointCloud
+
+    points, colours = POINTS.astype(np.float32), np.arange(120, dtype=np.uint8).reshape(40, 3)
+    packed = PointCloud.encode_rgb(colours).reshape(-1, 1)
+    points[3] = np.nan  # a pixel without a measurement
+    PointCloud.from_xyzrgb_points(np.hstack([points, packed])).save(tmp_path / "scan.pcd")
+    assert write_moved(tmp_path / "moved.ply", tmp_path / "scan.pcd", TURN) == (
+        "points and colours alone"
+    )
+    vertices = PlyData.read(tmp_path / "moved.ply")["vertex"]
+    moved, rgb = (np.stack([vertices[n] for n in names], 1) for names in ("xyz", COLOURS))
+    kept = np.arange(40) != 3
+    np.testing.assert_allclose(moved, points[kept] @ TURN[:3, :3].T + TURN[:3, 3], rtol=1e-12)
+    np.testing.assert_array_equal(rgb, colours[kept])
 
 
 def test_a_ply_that_plyfile_refuses_is_moved_as_its_mesh(tmp_path, monkeypatch):

@@ -115,7 +115,7 @@ def write_moved(path: Path, scan: Path, transform: np.ndarray) -> str:
     """Write a scan, moved by a rigid transform, as a binary PLY with coordinates in doubles.
 
     A PLY file keeps its faces, its colours and whatever else it holds; its normals turn with it.
-    Another mesh keeps its vertices and faces, another cloud its points.
+    Another mesh keeps its vertices and faces, another cloud its points, a PCD file its colours too.
 
     Args:
         path: to write.
@@ -123,8 +123,7 @@ def write_moved(path: Path, scan: Path, transform: np.ndarray) -> str:
         transform: (4, 4) float64.
 
     Returns:
-        What was written, for people: "with all that the PLY holds", "vertices and faces alone" or
-        "points alone".
+        What was written, for people: "with all that the PLY holds", "points alone" and the like.
 
     Raises:
         CorrmatError: there is no folder to write into, or see `read_scan`.
@@ -144,8 +143,11 @@ def write_moved(path: Path, scan: Path, transform: np.ndarray) -> str:
     points, faces = (
         (shape, None) if isinstance(shape, np.ndarray) else (shape.vertices, shape.faces)
     )
-    write_ply(path, points @ transform[:3, :3].T + transform[:3, 3], faces)
-    return "points alone" if faces is None else "vertices and faces alone"
+    colours = _pcd_colours(scan) if scan.suffix.lower() == ".pcd" else None
+    write_ply(path, points @ transform[:3, :3].T + transform[:3, 3], faces, colours)
+    if faces is not None:
+        return "vertices and faces alone"
+    return "points alone" if colours is None else "points and colours alone"
 
 
 def _move_vertices(vertices: "plyfile.PlyElement", transform: np.ndarray) -> None:
@@ -161,13 +163,19 @@ def _move_vertices(vertices: "plyfile.PlyElement", transform: np.ndarray) -> Non
                 vertices[field] = column
 
 
-def write_ply(path: Path, points: np.ndarray, faces: np.ndarray | None = None) -> None:
+def write_ply(
+    path: Path,
+    points: np.ndarray,
+    faces: np.ndarray | None = None,
+    colours: np.ndarray | None = None,
+) -> None:
     """Write points (N, 3) as a binary PLY of doubles, which keep detail far from the origin.
 
     Args:
         path: to write.
         points: (N, 3).
         faces: (F, 3) rows of points, if they are the vertices of a mesh.
+        colours: (N, 3) uint8, red, green and blue.
 
     Raises:
         CorrmatError: there is no such folder.
@@ -178,7 +186,14 @@ def write_ply(path: Path, points: np.ndarray, faces: np.ndarray | None = None) -
         f"element vertex {len(points)}",
         *(f"property double {axis}" for axis in "xyz"),
     ]
-    body = points.astype("<f8").tobytes()
+    vertices = np.empty(
+        len(points), [("xyz", "<f8", 3), ("rgb", "u1", 0 if colours is None else 3)]
+    )
+    vertices["xyz"] = points
+    if colours is not None:
+        header += [f"property uchar {name}" for name in ("red", "green", "blue")]
+        vertices["rgb"] = colours
+    body = vertices.tobytes()
     if faces is not None:
         header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
         triangles = np.empty(len(faces), [("corners", "u1"), ("rows", "<i4", 3)])
@@ -273,6 +288,18 @@ def _pcd(path: Path) -> np.ndarray:
     if len(points) != cloud.metadata.points:
         raise CorrmatError(f"{path} is cut short: {len(points)} of {cloud.metadata.points} points")
     return points
+
+
+def _pcd_colours(path: Path) -> np.ndarray | None:
+    """Read the colours (N, 3) of a PCD file's points as `read_shape` reads them; None without."""
+    from pypcd4.pypcd4 import PointCloud
+
+    cloud = PointCloud.from_path(path)
+    name = next((name for name in ("rgb", "rgba") if name in cloud.fields), None)
+    if name is None:
+        return None
+    measured = ~np.isnan(cloud.numpy(("x", "y", "z"))).any(1)
+    return PointCloud.decode_rgb(np.ascontiguousarray(cloud.pc_data[name]))[measured]
 
 
 def _numpy(path: Path) -> np.ndarray:
