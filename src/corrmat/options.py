@@ -340,8 +340,8 @@ def _add_register_options(parser: ArgumentParser) -> None:
     parser.add_argument("target", type=Path, help="the cloud or mesh that they are moved onto")
     parser.add_argument(
         "-o", "--output", type=Path, metavar="PLY",
-        help="write the moved source as a PLY, with the faces, and the colours of a PLY or PCD; the "
-        "folder to write them into, if there are several",
+        help="write the moved source as a PLY, with the faces, and the colours of a PLY or PCD; "
+        "the folder to write them into, if there are several",
     )  # fmt: skip
     parser.add_argument(
         "--json", type=Path, help="write matrix, confidence and verdict; - is standard output"
