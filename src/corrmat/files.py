@@ -5,10 +5,12 @@ import os
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
-
-from filelock import FileLock
+from typing import TYPE_CHECKING
 
 from corrmat.errors import CorrmatError
+
+if TYPE_CHECKING:
+    from filelock import FileLock
 
 
 def replace_text(path: Path, text: str) -> None:
@@ -47,8 +49,10 @@ def replace_bytes(path: Path, content: bytes | memoryview) -> None:
         partial.unlink(missing_ok=True)
 
 
-def folder_lock(folder: Path) -> FileLock:
+def folder_lock(folder: Path) -> "FileLock":
     """Return the lock that processes take before they write to a folder; it lies beside it."""
+    from filelock import FileLock  # slow, and `register` needs none
+
     folder.parent.mkdir(parents=True, exist_ok=True)
     return FileLock(folder.with_name(f".{folder.name}.lock"))
 

@@ -338,7 +338,7 @@ def _text(path: Path) -> np.ndarray:
     if not lines:
         return np.empty((0, 3))
     last = re.split(r"[;\s]+", lines[-1])
-    if sum(map(bool, map(_DECIMAL_COMMA, last))) > 2:  # "1,5;2,5;3,5", and not "1,2,3 4,5,6"
+    if sum(_DECIMAL_COMMA(cell) is not None for cell in last) > 2:
         raise CorrmatError(f"{path}: numbers like 1,5 need a decimal point")
     count = int(lines.pop(0)) if lines[0].isdigit() else 0  # of points, in PTS and XYZ files
     if count and len(lines) == count + 1 and not _XYZ.issubset(lines[0].lower().split()):

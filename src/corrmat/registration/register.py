@@ -84,11 +84,9 @@ def register(
     transform = candidates[chosen]
     if refine == "icp":
         transform = search.refine_chosen(transform)
-    agreement, coherence, _ = clouds.scorers[0].alignment(transform)
-    support = hypotheses.support(transform, *clouds.subsamples)
+    agreement, coherence, _, support, correlation = search.measure(transform[None])[0].tolist()
     agrees = hypotheses.match_support(transform, *clouds.subsamples) > 0
-    large = search.correlation_of_large
-    of_large = (coherence, large.at(transform)) if large else (None, None)
+    of_large = (coherence, correlation) if search.correlation_of_large else (None, None)
     confidence = _calibration().confidence(agreement, support if len(agrees) else None, *of_large)
     x, y = clouds.source, clouds.target
     fewest = min(len(x.rows), len(y.rows))

@@ -16,7 +16,6 @@ from corrmat.reporting.claims import (
     claims_of,
     count_verdicts,
     headline,
-    less_error,
     markdown_claims,
     other_verdicts_by_paper_metric,
     read_evidence,
@@ -96,17 +95,18 @@ def headline_table(results: Results) -> str:
     ]
     lines = markdown_head(heads)
     records = [r for r in longest_records(results.records) if r.id in HEADLINES]
-    lines += [markdown_row(headline(read_evidence(record, results.folder))) for record in records]
+    evidence = [read_evidence(record, results.folder) for record in records]
+    lines += [markdown_row(headline(each)) for each in evidence]
     ratios = [
         [arm_ratio(by_paper_metric(record, of)) or math.nan for of in (record.arms, record.paper)]
         for record in records
     ]
-    learnt = [less_error(read_evidence(r, results.folder)).verdict != "not shown" for r in records]
+    learnt = [each.left_identity(each.baseline) for each in evidence]
     ahead = sum(ours > 1 for ours, _ in ratios)
     near = sum(
         ours >= NEAR_PAPER * theirs
-        for (ours, theirs), shown in zip(ratios, learnt, strict=True)
-        if shown
+        for (ours, theirs), has_learnt in zip(ratios, learnt, strict=True)
+        if has_learnt
     )
     counted = count_verdicts(results.claims)
     return "\n".join(
