@@ -28,6 +28,7 @@ from corrmat.registration.choice import (
     CHOICE_WEIGHTS,
     CandidateSearch,
     ChoiceWeights,
+    Measures,
     choose,
 )
 from corrmat.registration.em_icp import em_icp
@@ -55,7 +56,7 @@ _SEED = 5  # of pairs that nothing else uses
 class CandidateTables(NamedTuple):
     """What candidates are worth; the last of them is the true transform."""
 
-    measures: np.ndarray  # (T + 1, 5) of `CandidateSearch.measure`
+    measures: list[Measures]  # of T + 1
     logits: np.ndarray  # (T + 1,) of the verification network
     errors: np.ndarray  # (2, T + 1, 2) degrees and ADD-S, after generalised ICP and after EM-ICP
 
@@ -92,7 +93,7 @@ def tables_of(pairs: PairBatch, index: int, generate: NetworkHypotheses) -> Pair
         len(hypotheses.transforms),
         len(search.refine_a_little(hypotheses.transforms)),
         CandidateTables(
-            np.concatenate([measures, search.measure(true)]),
+            measures + search.measure(true),
             search.verify(candidates),
             np.stack([errors_of(each) for each in (gicp, em)]),
         ),

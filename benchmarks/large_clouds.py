@@ -21,6 +21,7 @@ import numpy as np
 import open3d as o3d
 
 from corrmat.baselines import FpfhSettings, KissSettings, fpfh_ransac, kiss_matcher
+from corrmat.calibration import Scores
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG
 from corrmat.progress import track
 from corrmat.registration import benchmark
@@ -29,6 +30,7 @@ from corrmat.registration.choice import (
     LARGE_CLOUDS,
     CandidateSearch,
     ChoiceWeights,
+    Measures,
     choose,
 )
 from corrmat.registration.hypotheses import NetworkHypotheses
@@ -109,7 +111,7 @@ def run(pairs: PairBatch, name: str, voxel: float) -> ModelResult:
         transform, agreement = PIPELINES[name](source, target, voxel)
         ms = 1e3 * (time.perf_counter() - start)
         angle, adds = benchmark.errors(pairs, index, transform)
-        outcomes.append(benchmark.Outcome(angle, adds, ms, agreement, 1.0))
+        outcomes.append(benchmark.Outcome(angle, adds, ms, Scores(agreement, None)))
     return benchmark.summarise(pairs, outcomes)
 
 
@@ -135,7 +137,7 @@ def choices_of(
     own_measures = search.measure(own)
     found, measures = search.find(half_turns=True)
 
-    def chosen(among: np.ndarray, measured: np.ndarray, weights: ChoiceWeights) -> np.ndarray:
+    def chosen(among: np.ndarray, measured: list[Measures], weights: ChoiceWeights) -> np.ndarray:
         return among[choose(measured, weights, lambda rows: search.verify(among[rows]))]
 
     @functools.cache

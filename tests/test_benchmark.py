@@ -9,6 +9,7 @@ import pytest
 import torch
 from scipy.spatial import KDTree
 
+from corrmat.calibration import Scores
 from corrmat.cli import main
 from corrmat.data import registry
 from corrmat.data.scan_pairs import OVERLAP, make_object_pair, make_room_pair
@@ -47,8 +48,7 @@ def test_who_knows_the_truth_scores_everything_and_who_does_not_nothing(pairs, m
             transform[:3, :3] = transform[:3, :3] @ np.diag([1.0, -1, -1])
         result = type("Result", (), {})()
         result.transform, result.seconds = transform, 0.01
-        result.agreement, result.support = 1.0, 1.0
-        result.coherence = result.correlation = None
+        result.scores = Scores(1.0, 1.0)
         return result
 
     monkeypatch.setattr(benchmark, "register", answer)
@@ -62,12 +62,12 @@ def test_who_knows_the_truth_scores_everything_and_who_does_not_nothing(pairs, m
 
 def test_pairs_of_large_and_of_small_clouds_make_one_record():
     few = benchmark.frozen_pairs("clean", points=256, count=2)
-    outcomes = [benchmark.Outcome(1, 0, 5, 0.9, 0.8), benchmark.Outcome(2, 0, 5, 0.9, 0.8, 0.1, 2)]
-    result = benchmark.summarise(few, outcomes)
-    assert result.scores == [(0.9, 0.8, None, None), (0.9, 0.8, 0.1, 2)]
-    small, large = benchmark.summarise(few, outcomes[:1] * 2), benchmark.Outcome(2, 0, 5, 0.9, 0.8)
-    assert "coherence" not in small.per_pair
-    assert small.scores[0] == tuple(large[3:])
+    of_small, of_large = Scores(0.9, 0.8), Scores(0.9, 0.8, 0.1, 2)
+    small, large = (benchmark.Outcome(1, 0, 5, scores) for scores in (of_small, of_large))
+    assert benchmark.summarise(few, [small, large]).scores == [of_small, of_large]
+    result = benchmark.summarise(few, [small, small])
+    assert "coherence" not in result.per_pair
+    assert result.scores == [of_small] * 2
 
 
 def test_the_command_prints_one_table_and_writes_a_record(pairs, tmp_path, capsys):
@@ -115,8 +115,8 @@ def test_unrelated_clouds_are_of_different_families():
 def test_unrelated_pairs_are_counted_below_the_confidence(tmp_path):
     pairs = benchmark.unrelated(benchmark.frozen_pairs("clean", points=256, count=3), 2)
     (tmp_path / "register").mkdir()
-    scores = 0.0, 0.0, 0.0, 0.0
-    result = benchmark.summarise(pairs, [benchmark.Outcome(90, 1, 5, *scores)] * 2)
+    scores = Scores(0.0, 0.0, 0.0, 0.0)
+    result = benchmark.summarise(pairs, [benchmark.Outcome(90, 1, 5, scores)] * 2)
     write_comparison(
         tmp_path / "register" / "rooms-procedural-256.json",
         {"corrmat": result},

@@ -743,8 +743,8 @@ def test_only_a_network_with_matchabilities_says_which_points_have_no_match(gene
 
 
 def test_the_candidate_of_the_largest_weighted_sum_is_chosen():
-    first = [0.5, 0.1, 0.1, 0.5, 0.2]
-    measures = np.array([first, [0.6, 0.1, 0.5, 0.2, 0.1], first])
+    first = choice.Measures(0.5, 0.1, 0.1, 0.5, 0.2)
+    measures = [first, choice.Measures(0.6, 0.1, 0.5, 0.2, 0.1), first]
     for others, best in (
         ((0, 0, 0, 0), 1),
         ((0, -1, 0, 0), 0),
@@ -757,7 +757,7 @@ def test_the_candidate_of_the_largest_weighted_sum_is_chosen():
 
 def test_the_verification_network_is_asked_for_the_best_candidates_alone(monkeypatch):
     monkeypatch.setattr(choice, "VERIFIED", 2)
-    measures = np.array([[0.5, 0, 0, 0, 0], [0.6, 0, 0, 0, 0], [0.1, 0, 0, 0, 0]])
+    measures = [choice.Measures(agreement, 0, 0, 0, 0) for agreement in (0.5, 0.6, 0.1)]
     logits, asked = np.array([1.0, -1.0, 9.0]), []
 
     def verified(some):
@@ -958,10 +958,9 @@ def test_the_choice_is_by_agreement_coherence_unmatched_loss_and_support(pair):
     transforms = np.stack([prepared] * 2)
     transforms[0, :3, :3] @= np.diag([-1.0, -1.0, 1.0])
     search = choice.CandidateSearch(hypotheses, clouds)
-    wrong, right = search.measure(transforms)
-    better = np.sign([1.0, *choice.CHOICE_WEIGHTS[:-1]]) * (right - wrong)
+    wrong, right = measures = search.measure(transforms)
+    better = np.sign([1.0, *choice.CHOICE_WEIGHTS[:-1]]) * np.subtract(right, wrong)
     assert (better[[0, 2, 3]] > 0).all()
-    measures = np.stack([wrong, right])
     assert choice.choose(measures, choice.CHOICE_WEIGHTS, np.zeros_like) == 1
     wrongly, rightly = search.verify(transforms)
     assert rightly > wrongly
@@ -998,8 +997,8 @@ def test_a_small_scan_of_a_large_one_is_judged_as_small_clouds_are():
     scans = make_object_pair(0, 20_000, "val")
     large, small = (corrmat.register(scans.source[:n], scans.target) for n in (None, 300))
     assert large.verdict == small.verdict == "aligned"
-    assert None not in (large.coherence, large.correlation)
-    assert small.coherence is small.correlation is None
+    assert None not in large.scores
+    assert small.scores.coherence is small.scores.correlation is None
     for found in (large, small):
         assert angle_deg(found.transform[:3, :3], scans.rotation) < 1
 

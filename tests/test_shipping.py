@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from corrmat import load_model, weights
-from corrmat.calibration import shipped_calibration
+from corrmat.calibration import Scores, shipped_calibration
 from corrmat.errors import CorrmatError
 from corrmat.methods import InvariantCorr
 from corrmat.registration import calibrate, shipping, verification_training
@@ -55,8 +55,8 @@ def test_a_checkpoint_becomes_the_weights_of_the_package(checkpoint, package, tm
     assert set(run["validation"]) == {"real", "views", "clean", "dense", "rooms"}
     calibration = shipped_calibration()
     assert [*map(len, (calibration.both, calibration.large, calibration.agreement))] == [3, 4, 2]
-    assert 0 < calibration.confidence(0.5, 0.5) < 1
-    assert 0 < calibration.confidence(0.5, 0.5, 0.1, 0.3) < 1
+    assert 0 < calibration.confidence(Scores(0.5, 0.5)) < 1
+    assert 0 < calibration.confidence(Scores(0.5, 0.5, 0.1, 0.3)) < 1
     trained, shipped = load_model(checkpoint).state_dict(), load_model().state_dict()
     assert trained.keys() == shipped.keys()
     assert all(torch.equal(trained[key], shipped[key]) for key in trained)

@@ -2,7 +2,7 @@
 
 import json
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -33,50 +33,47 @@ def as_percent(confidence: float) -> str:
     return f"{int(100 * confidence)}%"
 
 
+class Scores(NamedTuple):
+    """What the confidence of a registration is computed from."""
+
+    agreement: float  # in [0, 1]: how much of each cloud lies on the other
+    support: float | None  # in [0, 1]: share of the matches that the transform explains, if any
+    coherence: float | None = None  # of two clouds of more than 2,048 points
+    correlation: float | None = None  # their phase correlation
+
+    def of_large_clouds(self) -> tuple[float, float, float] | None:
+        """Return what the curve of two large clouds is over, of order one; None for others.
+
+        Agreement is not among it: two rooms that have nothing in common agree well, too.
+        """
+        if self.support is None or self.coherence is None or self.correlation is None:
+            return None
+        height = float(np.log(max(self.correlation, _LEAST_CORRELATION)))
+        return self.support, 4 * self.coherence, height
+
+
 @dataclass(frozen=True)
 class Calibration:
     """Logistic curves from the scores of a registration to the chance that it is right.
 
-    Coefficients are over (agreement, support, 1); over (`of_large_clouds`, 1) for large clouds; and
-    over (agreement, 1) for models without matches. `registration.calibrate` fits them.
+    Coefficients are over (agreement, support, 1); over (`Scores.of_large_clouds`, 1) for large
+    clouds; and over (agreement, 1) for models without matches. `registration.calibrate` fits them.
     """
 
     both: list[float]
     large: list[float]
     agreement: list[float]
 
-    def confidence(
-        self,
-        agreement: float,
-        support: float | None,
-        coherence: float | None = None,
-        correlation: float | None = None,
-    ) -> float:
-        """Compute the chance that a registration is right.
-
-        Args:
-            agreement: of the two clouds, in [0, 1].
-            support: of the matches, in [0, 1]; None for a model without matches.
-            coherence: of two large clouds; None for others.
-            correlation: their phase correlation; None for others.
-        """
-        if support is None:
-            logit = np.dot(self.agreement, [agreement, 1.0])
-        elif coherence is None or correlation is None:
-            logit = np.dot(self.both, [agreement, support, 1.0])
+    def confidence(self, scores: Scores) -> float:
+        """Compute the chance that a registration is right."""
+        of_large = scores.of_large_clouds()
+        if scores.support is None:
+            logit = np.dot(self.agreement, [scores.agreement, 1.0])
+        elif of_large is None:
+            logit = np.dot(self.both, [scores.agreement, scores.support, 1.0])
         else:
-            logit = np.dot(self.large, [*of_large_clouds(support, coherence, correlation), 1.0])
+            logit = np.dot(self.large, [*of_large, 1.0])
         return float(1 / (1 + np.exp(-logit)))
-
-
-def of_large_clouds(
-    support: float, coherence: float, correlation: float
-) -> tuple[float, float, float]:
-    """Bring the scores of two large clouds to numbers of order one for their curve.
-
-    Agreement is not among them: two rooms that have nothing in common agree well, too.
-    """
-    return support, 4 * coherence, float(np.log(max(correlation, _LEAST_CORRELATION)))
 
 
 def shipped_calibration() -> Calibration:

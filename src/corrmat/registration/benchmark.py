@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from scipy.spatial import KDTree
 
+from corrmat.calibration import Scores
 from corrmat.data.pairs import STREAM, Key, PairSettings, Split, make_pairs
 from corrmat.data.registry import load_clouds
 from corrmat.data.scan_pairs import ScanPair, make_object_pair, make_room_pair
@@ -18,7 +19,7 @@ from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG, rotation_error_deg
 from corrmat.ops import rigid
 from corrmat.progress import track
 from corrmat.registration.register import register
-from corrmat.reporting.model_results import SCORES, ModelResult
+from corrmat.reporting.model_results import ModelResult
 from corrmat.types import PairBatch
 
 Protocol = Literal["paper", "real", "views", "clean", "dense", "rooms"]
@@ -63,10 +64,7 @@ class Outcome(NamedTuple):
     angle_deg: float
     adds: float
     ms: float
-    agreement: float
-    support: float
-    coherence: float | None = None
-    correlation: float | None = None
+    scores: Scores
 
 
 def frozen_pairs(
@@ -168,7 +166,7 @@ def compare(pairs: PairBatch, models: Sequence[str]) -> dict[str, ModelResult]:
 def summarise(pairs: PairBatch, outcomes: Sequence[Outcome]) -> ModelResult:
     """Compute a model's result from its outcome on every pair."""
     angle, adds, ms = map(np.array, zip(*(outcome[:3] for outcome in outcomes), strict=True))
-    scores = {name: [getattr(outcome, name) for outcome in outcomes] for name in SCORES}
+    scores = zip(*(outcome.scores for outcome in outcomes), strict=True)
     return ModelResult(
         mean_deg=float(angle.mean()),
         median_deg=float(np.median(angle)),
@@ -181,7 +179,7 @@ def summarise(pairs: PairBatch, outcomes: Sequence[Outcome]) -> ModelResult:
             "adds": np.round(adds, 5).tolist(),
             **{
                 name: [None if value is None else round(value, 4) for value in values]
-                for name, values in scores.items()
+                for name, values in zip(Scores._fields, scores, strict=True)
                 if any(value is not None for value in values)
             },
         },
@@ -206,8 +204,7 @@ def _register_pair(pairs: PairBatch, index: int, model: str) -> Outcome:
     source, target = (c[index].double().numpy() for c in (pairs.source, pairs.target))
     result = register(source, target, model=model)
     angle, adds = errors(pairs, index, result.transform)
-    scores = (getattr(result, name) for name in SCORES)
-    return Outcome(angle, adds, 1e3 * result.seconds, *scores)
+    return Outcome(angle, adds, 1e3 * result.seconds, result.scores)
 
 
 def errors(pairs: PairBatch, index: int, transform: np.ndarray) -> tuple[float, float]:

@@ -6,7 +6,7 @@ from dataclasses import asdict, replace
 import numpy as np
 from scipy.optimize import minimize
 
-from corrmat.calibration import SURE, Calibration, of_large_clouds
+from corrmat.calibration import SURE, Calibration, Scores
 from corrmat.data.datamodule import RegistrationDataModule
 from corrmat.data.pairs import STREAM, Key, make_pairs
 from corrmat.data.shapes.dataset import ASSEMBLY
@@ -57,29 +57,31 @@ def calibrate(model: str) -> tuple[dict[str, list[float]], dict[str, float]]:
         large_scores += more
         large_aligned += right
     curve = Calibration(
-        both=_fit_logistic(np.array(scores)[:, :2].astype(float), np.array(aligned, float)),
+        both=_fit_logistic(
+            np.array([(each.agreement, each.support) for each in scores]), np.array(aligned, float)
+        ),
         large=_fit_logistic(
-            np.array([of_large_clouds(*each[1:]) for each in large_scores]),
+            np.array([each.of_large_clouds() for each in large_scores]),
             np.array(large_aligned, float),
         ),
         agreement=_fit_logistic(
-            np.array([each[:1] for each in scores + icp_scores]),
+            np.array([[each.agreement] for each in scores + icp_scores]),
             np.array(aligned + icp_aligned, float),
         ),
     )
     for values, right in ((scores, aligned), (large_scores, large_aligned)):
-        sure = np.array([curve.confidence(*each) >= SURE for each in values])
+        sure = np.array([curve.confidence(each) >= SURE for each in values])
         wrongly = np.mean(sure & ~np.array(right))
         called = f"{sure.mean():.1%} of {len(values)} held-out pairs, {wrongly:.1%} wrongly"
         print(f'called "aligned": {called}')
     return asdict(curve), recalls
 
 
-def _outcomes(pairs: PairBatch, model: str) -> tuple[float, list[tuple[float, ...]], list[bool]]:
+def _outcomes(pairs: PairBatch, model: str) -> tuple[float, list[Scores], list[bool]]:
     """Register pairs, and some of their clouds with unrelated ones.
 
     Returns:
-        The share of the pairs that are within 5 degrees; the scores of all, as `SCORES`; and
+        The share of the pairs that are within 5 degrees; the scores of all; and
         whether they are aligned, which unrelated clouds never are.
     """
     unrelated_pairs = benchmark.unrelated(pairs, CALIBRATION_UNRELATED)

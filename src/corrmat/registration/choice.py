@@ -1,10 +1,11 @@
 """The choice among a model's candidates, and the refinement of the chosen one."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from corrmat.calibration import Scores
 from corrmat.ops import rigid
 from corrmat.registration.em_icp import WIDTHS, em_icp
 from corrmat.registration.hypotheses import Hypotheses, HypothesisGenerator
@@ -24,16 +25,33 @@ from corrmat.registration.verification import verify
 
 
 class ChoiceWeights(NamedTuple):
-    """Weights of a candidate's score: its agreement plus the weighted sum of the other measures.
-
-    All but the last are in the order of the measures' columns, whose first is the agreement.
-    """
+    """Weights of a candidate's score: its agreement plus the weighted sum of these."""
 
     coherence: float
     unmatched_loss: float
     support: float
-    correlation: float  # phase correlation
+    correlation: float
     verification: float  # the logit of the verification network, for the best of the others' sum
+
+
+class Measures(NamedTuple):
+    """What the choice among candidates weighs of one, but for the verification."""
+
+    agreement: float  # see `scoring.Alignment`
+    coherence: float  # likewise
+    unmatched_loss: float  # see `Hypotheses`; 0 without matchabilities
+    support: float  # likewise; 1 without matches
+    correlation: float  # phase correlation; 0 unless both clouds are large
+
+    def weigh(self, weights: ChoiceWeights) -> float:
+        """Sum the measures to a score, without the verification."""
+        return (
+            self.agreement
+            + weights.coherence * self.coherence
+            + weights.unmatched_loss * self.unmatched_loss
+            + weights.support * self.support
+            + weights.correlation * self.correlation
+        )
 
 
 CHOICE_WEIGHTS = ChoiceWeights(4.0, -1.0, 0.2, 0.0, 0.05)  # benchmarks/choice.py
@@ -75,32 +93,30 @@ def half_turned(transform: np.ndarray, subsamples: tuple[np.ndarray, np.ndarray]
 
 
 def choose(
-    measures: np.ndarray,
+    measures: Sequence[Measures],
     weights: ChoiceWeights,
     verified: Callable[[np.ndarray], np.ndarray],
 ) -> int:
     """Choose the candidate of the highest score; only the best by measures are verified.
 
     Args:
-        measures: (T, 5) of `CandidateSearch.measure`.
-        weights: beside agreement's 1.
+        measures: of T candidates.
+        weights: of the measures.
         verified: what `verify` says of the candidates at (n,) indices.
     """
     best = best_by_measures(measures, weights, VERIFIED)
     if len(best) == 1:
         return int(best[0])
-    scores = weigh(measures[best], weights) + weights.verification * verified(best)
-    return int(best[np.argmax(scores)])
+    scores = [measures[index].weigh(weights) for index in best]
+    return int(best[np.argmax(scores + weights.verification * verified(best))])
 
 
-def best_by_measures(measures: np.ndarray, weights: ChoiceWeights, count: int) -> np.ndarray:
-    """Return the indices of the candidates of the highest sums of measures (T, 5), best first."""
-    return np.argsort(-weigh(measures, weights), kind="stable")[:count]
-
-
-def weigh(measures: np.ndarray, weights: ChoiceWeights) -> np.ndarray:
-    """Sum measures (T, 5) to scores (T,), without the verification."""
-    return measures @ [1.0, *weights[:4]]
+def best_by_measures(
+    measures: Sequence[Measures], weights: ChoiceWeights, count: int
+) -> np.ndarray:
+    """Return the indices of the candidates whose measures weigh most, best first."""
+    scores = np.array([each.weigh(weights) for each in measures])
+    return np.argsort(-scores, kind="stable")[:count]
 
 
 class CandidateSearch:
@@ -167,7 +183,7 @@ class CandidateSearch:
         unmatched = self.hypotheses.unmatched_nll
         return WITHOUT_MATCHABILITIES if unmatched is None else CHOICE_WEIGHTS
 
-    def find(self, *, half_turns: bool) -> tuple[np.ndarray, np.ndarray]:
+    def find(self, *, half_turns: bool) -> tuple[np.ndarray, list[Measures]]:
         """Refine and measure hypotheses, drop copies, and add what the best may be mistaken for.
 
         If a cloud is large, the peaks of the phase correlation are hypotheses, too. A thing that is
@@ -179,7 +195,7 @@ class CandidateSearch:
                 right transform; the measures cannot.
 
         Returns:
-            Transforms (T, 4, 4), half turns last, and their measures (T, 5).
+            Transforms (T, 4, 4), half turns last, and their measures.
         """
         correlation = self.phase_correlation
         transforms = self.hypotheses.transforms
@@ -196,8 +212,7 @@ class CandidateSearch:
         best = refined[best_by_measures(measures, self.weights, HALF_TURNED)]
         turned = np.concatenate([half_turned(each, self.clouds.subsamples) for each in best])
         candidates = distinct(np.concatenate([refined, self.refine_a_little(turned)]))
-        added = self.measure(candidates[len(refined) :])
-        return candidates, np.concatenate([measures, added])
+        return candidates, measures + self.measure(candidates[len(refined) :])
 
     def refine_a_little(self, transforms: np.ndarray) -> np.ndarray:
         """Refine transforms (T, 4, 4) by generalised ICP, and drop copies: to (D, 4, 4).
@@ -209,22 +224,25 @@ class CandidateSearch:
         coarse = self._scorer.coarse
         return distinct(np.stack([coarse.refine(each, CANDIDATE_STEPS) for each in transforms]))
 
-    def measure(self, transforms: np.ndarray) -> np.ndarray:
-        """Measure what the choice among transforms (T, 4, 4) weighs.
-
-        Returns:
-            (T, 5): agreement, coherence, unmatched loss, support, and phase correlation (0 unless
-            both clouds are large).
-        """
+    def measure(self, transforms: np.ndarray) -> list[Measures]:
+        """Measure what the choice among transforms (T, 4, 4) weighs."""
         correlation = self.correlation_of_large
-        rows = []
+        measures = []
         for transform in transforms:
             agreement, coherence, distances = self._scorer.alignment(transform)
             unmatched = self.hypotheses.unmatched_loss(distances)
             support = self.hypotheses.support(transform, *self.clouds.subsamples)
             height = correlation.at(transform) if correlation else 0.0
-            rows.append((agreement, coherence, unmatched, support, height))
-        return np.reshape(rows, (-1, 5))
+            measures.append(Measures(agreement, coherence, unmatched, support, height))
+        return measures
+
+    def scores(self, transform: np.ndarray) -> Scores:
+        """Compute what the confidence in a transform (4, 4) rests on."""
+        measures = self.measure(transform[None])[0]
+        support = measures.support if len(self.hypotheses.matches) else None
+        if not self.correlation_of_large:
+            return Scores(measures.agreement, support)
+        return Scores(measures.agreement, support, measures.coherence, measures.correlation)
 
     def verify(self, transforms: np.ndarray) -> np.ndarray:
         """Score transforms (T, 4, 4) by the verification network: (T,) logits, zeros without."""

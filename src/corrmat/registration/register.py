@@ -84,10 +84,9 @@ def register(
     transform = candidates[chosen]
     if refine == "icp":
         transform = search.refine_chosen(transform)
-    agreement, coherence, _, support, correlation = search.measure(transform[None])[0].tolist()
     agrees = hypotheses.match_support(transform, *clouds.subsamples) > 0
-    of_large = (coherence, correlation) if search.correlation_of_large else (None, None)
-    confidence = _calibration().confidence(agreement, support if len(agrees) else None, *of_large)
+    scores = search.scores(transform)
+    confidence = _calibration().confidence(scores)
     x, y = clouds.source, clouds.target
     fewest = min(len(x.rows), len(y.rows))
     overlap, rmse, slides_along, turns_about = clouds.scorers[-1].overlap(transform)
@@ -100,10 +99,7 @@ def register(
         matches=np.stack(rows, 1),
         match_confidence=hypotheses.confidence,
         match_agrees=agrees,
-        agreement=agreement,
-        support=support,
-        coherence=of_large[0],
-        correlation=of_large[1],
+        scores=scores,
         confidence=confidence,
         calibrated=hypotheses.verification is not None and refine == "icp",
         rmse=rmse / clouds.scale,

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from corrmat.calibration import as_percent
+from corrmat.calibration import Scores, as_percent
 from corrmat.errors import CorrmatError
 from corrmat.ops import rigid
 
@@ -20,10 +20,7 @@ class Registration:
     matches: np.ndarray  # (K, 2) int64 rows of source and target; K = 0 for models without
     match_confidence: np.ndarray  # (K,) in [0, 1]; neighbours of the same point share it
     match_agrees: np.ndarray  # (K,) bool: whether the transform takes one end near the other
-    agreement: float  # in [0, 1]: how much of each cloud lies on the other
-    support: float  # in [0, 1]: share of the matches that the transform explains; 1 without any
-    coherence: float | None  # of two clouds of more than 2,048 points; None for others
-    correlation: float | None  # their phase correlation; None for others
+    scores: Scores  # what the confidence is computed from
     confidence: float  # in [0, 1]: chance that the clouds are aligned
     calibrated: bool  # whether it was fitted to this model and refinement: shipped weights and ICP
     rmse: float  # of aligned source points near a target point, in the clouds' units

@@ -349,7 +349,7 @@ def _verdicts(confidence: np.ndarray) -> np.ndarray:
 def _confidence(result: ModelResult) -> np.ndarray:
     """Compute what the shipped calibration promised for each pair."""
     calibration = shipped_calibration()
-    return np.array([calibration.confidence(*scores) for scores in result.scores])
+    return np.array([calibration.confidence(scores) for scores in result.scores])
 
 
 def _recall_cells(result: ModelResult, ours: np.ndarray | None) -> list[str]:

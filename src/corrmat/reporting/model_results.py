@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from corrmat.calibration import Scores
 from corrmat.files import replace_json
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG
-
-SCORES = "agreement", "support", "coherence", "correlation"  # see `Calibration.confidence`
 
 
 @dataclass(frozen=True)
@@ -37,10 +36,11 @@ class ModelResult:
         return np.array(self.per_pair["adds"]) < ADDS_THRESHOLD
 
     @property
-    def scores(self) -> list[tuple[Any, ...]]:
-        """Return what the confidence of each pair is computed from, as `SCORES`; else None."""
+    def scores(self) -> list[Scores]:
+        """Return what the confidence of each pair is computed from."""
         none = [None] * len(self.per_pair["agreement"])
-        return list(zip(*(self.per_pair.get(name, none) for name in SCORES), strict=True))
+        columns = (self.per_pair.get(name, none) for name in Scores._fields)
+        return [Scores(*scores) for scores in zip(*columns, strict=True)]
 
 
 @dataclass(frozen=True)
