@@ -18,6 +18,7 @@ from corrmat.files import replace_bytes
 
 if TYPE_CHECKING:
     import plyfile
+    import pypcd4.pypcd4
     import trimesh
 
 MESHES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
@@ -28,6 +29,7 @@ _XYZ = {"x", "y", "z"}
 _NORMALS = ("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z")
 _MOST_COLUMNS = 32  # of an array of points: x, y, z, and whatever else was measured
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+").fullmatch
+_PCD_VERSION = re.compile(rb"^VERSION .*$", re.MULTILINE)
 _FACES = re.compile(rb"^element (face|tristrips) +[1-9]", re.MULTILINE)
 
 
@@ -279,11 +281,19 @@ def _stack(vertices: "plyfile.PlyElement", fields: Sequence[str]) -> np.ndarray:
     return np.stack([np.asarray(vertices[field], np.float64) for field in fields], 1)
 
 
-def _pcd(path: Path) -> np.ndarray:
-    """Read the points of a PCD file."""
+def _open_pcd(path: Path) -> "pypcd4.pypcd4.PointCloud":
+    """Read a PCD file. The reader wants version 0.7; older ones differ in the number alone."""
     from pypcd4.pypcd4 import PointCloud
 
-    cloud = PointCloud.from_path(path)
+    header, data, rows = path.read_bytes().partition(b"\nDATA ")
+    header = _PCD_VERSION.sub(b"VERSION 0.7", header, 1)
+    content = io.BytesIO(header + data + rows)
+    return PointCloud.from_fileobj(io.BufferedReader(content))
+
+
+def _pcd(path: Path) -> np.ndarray:
+    """Read the points of a PCD file."""
+    cloud = _open_pcd(path)
     points = cloud.numpy(("x", "y", "z"))
     if len(points) != cloud.metadata.points:
         raise CorrmatError(f"{path} is cut short: {len(points)} of {cloud.metadata.points} points")
@@ -294,7 +304,7 @@ def _pcd_colours(path: Path) -> np.ndarray | None:
     """Read the colours (N, 3) of a PCD file's points as `read_shape` reads them; None without."""
     from pypcd4.pypcd4 import PointCloud
 
-    cloud = PointCloud.from_path(path)
+    cloud = _open_pcd(path)
     name = next((name for name in ("rgb", "rgba") if name in cloud.fields), None)
     if name is None:
         return None

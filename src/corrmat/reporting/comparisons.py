@@ -19,6 +19,7 @@ OURS = "corrmat"
 TRAINING = Path("register", "training.json")  # below results/: how the shipped weights were trained
 UNRELATED = Path("register", "unrelated.json")  # what they make of clouds of two different things
 FREE_MOTIONS = Path("register", "free_motions.json")  # of what slides or turns, and of others
+REAL_SCANS = Path("register", "real_scans.json")  # of scans that were not simulated
 _PROTOCOLS = ("real", "views", "clean", "dense", "rooms")  # in the order of the tables
 _SMALL = "real", "views", "clean"  # clouds of at most 1,024 points
 # Protocols of each kind of clouds.
@@ -49,6 +50,18 @@ class FreeMotionsRow(TypedDict):
     turns: int  # registrations after which any turn about an axis is said to fit as well
     right: int | None  # with the right direction or axis; None where nothing slides or turns
     aligned: int  # registrations that are called "aligned"
+
+
+class RealScansRow(TypedDict):
+    """A row of results/register/real_scans.json: two scans, from several poses of the source."""
+
+    scans: str
+    points: list[int]  # of source and target
+    registrations: int
+    right: dict[str, int] | None  # by model; None where the scans show nothing in common
+    median_deg: float | None  # ours
+    verdicts: list[int]  # on ours: aligned, probably aligned, doubtful
+    seconds: float  # ours
 
 
 def comparison_summary(results: Path) -> str:
@@ -324,6 +337,32 @@ def free_motions_table(results: Path) -> str:
     for row in json.loads(path.read_text())["rows"]:
         cells = ["" if row[name] is None else str(row[name]) for name in heads]
         lines.append(markdown_row(cells))
+    return "\n".join(lines)
+
+
+def real_scans_table(results: Path) -> str:
+    """Build the table of real scans: ours with its verdicts, and how often others are right."""
+    path = results / REAL_SCANS
+    if not path.is_file():
+        return "No real scans are recorded; `benchmarks/real_scans.py` registers some."
+    rows: list[RealScansRow] = json.loads(path.read_text())["rows"]
+    models = list(rows[0]["right"] or {})
+    verdicts = ", ".join(get_args(Verdict))
+    lines = markdown_head(["scans", "points", *models, "median deg", verdicts, "s"])
+    for row in rows:
+        right = row["right"] or {}
+        lines.append(
+            markdown_row(
+                [
+                    row["scans"],
+                    ", ".join(f"{count:,}" for count in row["points"]),
+                    *(f"{right[m]} of {row['registrations']}" if right else "" for m in models),
+                    "" if row["median_deg"] is None else f"{row['median_deg']:.2g}",
+                    ", ".join(map(str, row["verdicts"])),
+                    f"{row['seconds']:.1f}",
+                ]
+            )
+        )
     return "\n".join(lines)
 
 

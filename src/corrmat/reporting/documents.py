@@ -32,6 +32,7 @@ from corrmat.reporting.comparisons import (
     free_motions_table,
     large_choice_table,
     networks_table,
+    real_scans_table,
 )
 from corrmat.reporting.intervals import Estimate, as_text
 from corrmat.reporting.matrices import draw_matrices
@@ -289,6 +290,7 @@ TABLES: tuple[tuple[str, str, Callable[[Results], str]], ...] = (
     ("docs/register.md", "networks", lambda results: networks_table(results.folder)),
     ("docs/register.md", "families", lambda results: families_table(results.folder)),
     ("docs/register.md", "doubling", lambda results: doubling_summary(results.folder)),
+    ("docs/register.md", "real_scans", lambda results: real_scans_table(results.folder)),
     ("docs/register.md", "free_motions", lambda results: free_motions_table(results.folder)),
     ("docs/register.md", "confidence", lambda results: confidence_table(results.folder)),
     ("docs/speed.md", "bench", lambda results: bench_table(results.folder)),
