@@ -7,7 +7,7 @@ FPFH + RANSAC (Open3D) and KISS-Matcher get the whole clouds on a voxel grid. It
 other pairs. `phase` is the highest peak of phase correlation between the Manhattan frames, without
 any network. All are refined by the same generalised ICP, coarse to fine. The record is
 results/register/<protocol>-procedural-20000.json. `choice` in it says, on those other pairs, what
-the candidates of phase correlation and the weights of large clouds are worth
+the candidates of large clouds, and the weights of their measures, are worth
 (`registration/choice.py`; the weights were chosen on further ones).
 """
 
@@ -16,6 +16,7 @@ import functools
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import open3d as o3d
@@ -24,7 +25,7 @@ from corrmat.baselines import FpfhSettings, KissSettings, fpfh_ransac, kiss_matc
 from corrmat.calibration import Scores
 from corrmat.metrics import ADDS_THRESHOLD, RECALL_DEG
 from corrmat.progress import track
-from corrmat.registration import benchmark
+from corrmat.registration import benchmark, choice
 from corrmat.registration.choice import (
     CHOICE_WEIGHTS,
     LARGE_CLOUDS,
@@ -136,6 +137,8 @@ def choices_of(
     own = search.refine_a_little(search.hypotheses.transforms)
     own_measures = search.measure(own)
     found, measures = search.find(half_turns=True)
+    with mock.patch.object(choice, "MANY_KEPT", 0):
+        fewer, fewer_measures = search.find(half_turns=True)
 
     def chosen(among: np.ndarray, measured: list[Measures], weights: ChoiceWeights) -> np.ndarray:
         return among[choose(measured, weights, lambda rows: search.verify(among[rows]))]
@@ -150,6 +153,7 @@ def choices_of(
     picked = {
         f"those of small clouds, {alone}": chosen(own, own_measures, CHOICE_WEIGHTS),
         f"in use, {alone}": chosen(own, own_measures, LARGE_CLOUDS),
+        "in use, without many matches": chosen(fewer, fewer_measures, LARGE_CLOUDS),
     }
     picked |= {name: chosen(found, measures, weights) for name, weights in WEIGHTS.items()}
     return {name: errors(transform.tobytes()) for name, transform in picked.items()}

@@ -8,7 +8,8 @@ The scans are not ours and are not part of this repository. FOLDER has three fol
   Armadillo on a turntable, by the Stanford Computer Graphics Laboratory; the files' names give its
   angle.
 - small_gicp: small-gicp 1.0.1's source distribution (`pip download --no-deps --no-binary small-gicp
-  small-gicp==1.0.1`), unpacked. Two sweeps of a car's LiDAR, with its author's estimate of the pose.
+  small-gicp==1.0.1`), unpacked. Two sweeps of a car's LiDAR, with the author's estimate of the
+  pose.
 - pcl: the sources of PCL 1.15.0 (its repository, or `apt-get source --download-only pcl`). Two
   range scans of the Stanford bunny, thinned to 400 points; frames of a depth camera that was held
   by hand, a quarter of a second apart, which are taken to show no motion; keypoints of two scans of

@@ -29,6 +29,7 @@ from corrmat.ops import rigid
 from corrmat.ops.correspondence import MatchabilityCorrespondence, SoftCorrespondence
 from corrmat.options import REGISTER_EPILOG
 from corrmat.registration import animation, choice, example, preparation, result
+from corrmat.registration import hypotheses as generation
 from corrmat.registration import register as registration
 from corrmat.registration.animation import registration_gif
 from corrmat.registration.em_icp import em_icp
@@ -965,6 +966,27 @@ def test_the_choice_is_by_agreement_coherence_unmatched_loss_and_support(pair):
     wrongly, rightly = search.verify(transforms)
     assert rightly > wrongly
     assert not verify(transforms, hypotheses._replace(verification=None), clouds.subsamples).any()
+
+
+def test_more_matches_say_what_the_strongest_do_not(monkeypatch):
+    """Where two scans share little, the strongest matches may all be wrong."""
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(700, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    source = np.hstack([normals * (0.6, 0.8, 1.0), normals])
+    truth = rigid.to_homogeneous(Rotation.random(rng=rng).as_matrix(), np.array([0.2, 0.1, 0.0]))
+    target = np.hstack([rigid.move(truth, source[:, :3]), source[:, 3:] @ truth[:3, :3].T])
+    prob = torch.zeros(700, 700)
+    prob[range(256), rng.permutation(256)] = 0.9
+    prob[range(256, 700), range(256, 700)] = 0.5
+
+    def nearest():
+        found = generation.from_many_matches(prob, source, target, 0)
+        return np.linalg.norm(found - truth, axis=(1, 2)).min()
+
+    assert nearest() < 0.05
+    monkeypatch.setattr(generation, "_MANY", 256)
+    assert nearest() > 0.3
 
 
 def registered(room):

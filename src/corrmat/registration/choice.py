@@ -8,7 +8,7 @@ import numpy as np
 from corrmat.calibration import Scores
 from corrmat.ops import rigid
 from corrmat.registration.em_icp import WIDTHS, em_icp
-from corrmat.registration.hypotheses import Hypotheses, HypothesisGenerator
+from corrmat.registration.hypotheses import Hypotheses, HypothesisGenerator, from_many_matches
 from corrmat.registration.phase_correlation import PhaseCorrelation
 from corrmat.registration.preparation import (
     MODEL_POINTS,
@@ -58,6 +58,7 @@ CHOICE_WEIGHTS = ChoiceWeights(4.0, -1.0, 0.2, 0.0, 0.05)  # benchmarks/choice.p
 LARGE_CLOUDS = ChoiceWeights(8.0, 0.0, 0.0, 5.0, 0.05)  # benchmarks/large_clouds.py
 WITHOUT_MATCHABILITIES = ChoiceWeights(1.5, 0.0, 0.0, 0.0, 0.0)  # for other models
 PEAKS = 16  # candidates from phase correlation
+MANY_KEPT = 24  # candidates at most of those from many more matches
 HALF_TURNED = 3  # candidates at most
 VERIFIED = 8  # candidates at most
 CANDIDATE_STEPS = 5  # of generalised ICP, for each candidate; EM-ICP with matches does the rest
@@ -186,9 +187,9 @@ class CandidateSearch:
     def find(self, *, half_turns: bool) -> tuple[np.ndarray, list[Measures]]:
         """Refine and measure hypotheses, drop copies, and add what the best may be mistaken for.
 
-        If a cloud is large, the peaks of the phase correlation are hypotheses, too. A thing that is
-        nearly symmetric fits itself after half a turn. So the best candidates are turned by 180
-        degrees about each principal axis as well.
+        If a cloud is large, the peaks of the phase correlation are hypotheses, too, and what many
+        more matches say. A thing that is nearly symmetric fits itself after half a turn. So the
+        best candidates are turned by 180 degrees about each principal axis as well.
 
         Args:
             half_turns: whether to add them. Only a verification network can tell them from the
@@ -203,6 +204,8 @@ class CandidateSearch:
             peaks = correlation.peaks(transforms[:, :3, :3], PEAKS)
             transforms = np.concatenate([transforms, peaks])
         refined = self.refine_a_little(transforms)
+        if correlation:
+            refined = distinct(np.concatenate([refined, self._from_many_matches()]))
         if len(self._guesses):
             from_guesses = np.stack([self._scorer.refine(each) for each in self._guesses])
             refined = distinct(np.concatenate([from_guesses, self._guesses, refined]))
@@ -214,15 +217,24 @@ class CandidateSearch:
         candidates = distinct(np.concatenate([refined, self.refine_a_little(turned)]))
         return candidates, measures + self.measure(candidates[len(refined) :])
 
+    def _from_many_matches(self) -> np.ndarray:
+        """Fit and refine transforms to many more matches, and keep the best: (T, 4, 4)."""
+        prob, clouds = self.hypotheses.prob, self.clouds
+        assert prob is not None
+        refined = self.refine_a_little(from_many_matches(prob, *clouds.subsamples, clouds.seed))
+        agreement = np.array([self._scorer.coarse.alignment(each).agreement for each in refined])
+        return refined[np.argsort(-agreement, kind="stable")[:MANY_KEPT]]
+
     def refine_a_little(self, transforms: np.ndarray) -> np.ndarray:
         """Refine transforms (T, 4, 4) by generalised ICP, and drop copies: to (D, 4, 4).
 
         With matches, few iterations on few points do: EM-ICP follows.
         """
         if self.hypotheses.prob is None:
-            return distinct(np.stack([self._scorer.refine(each) for each in transforms]))
-        coarse = self._scorer.coarse
-        return distinct(np.stack([coarse.refine(each, CANDIDATE_STEPS) for each in transforms]))
+            refined = [self._scorer.refine(each) for each in transforms]
+        else:
+            refined = [self._scorer.coarse.refine(each, CANDIDATE_STEPS) for each in transforms]
+        return distinct(np.reshape(refined, (-1, 4, 4)))
 
     def measure(self, transforms: np.ndarray) -> list[Measures]:
         """Measure what the choice among transforms (T, 4, 4) weighs."""

@@ -34,6 +34,7 @@ from corrmat.weights import load_verification
 _STRONGEST = 256  # matches that RANSAC draws from
 _INLIER_THRESHOLD = 0.15  # largest residual of a match
 _BY_MATCHES, _BY_AGREEMENT = 16, 24  # hypotheses at most
+_MANY, _BY_MANY = 2048, 200  # the same of large clouds: matches, and hypotheses by agreement
 _ROUGH_POINTS = 64, 256  # of source and target, to rank them by
 _ROUGH_DISTANCE = 0.3  # beyond which two points do not agree
 _MAX_UNMATCHED_NLL = 8.0  # of a point: the network may be wrong
@@ -126,25 +127,22 @@ class NetworkHypotheses:
         if correspondence is None:
             return Hypotheses(own_transform, *_NO_MATCHES)
         prob = correspondence.prob()[0, :, : y.shape[1]].cpu()
-        # The strongest entries that are the maximum of their row or of their column.
-        is_max = (prob == prob.amax(0)) | (prob == prob.amax(1, keepdim=True))
-        weight, place = (prob * is_max).flatten().topk(min(_STRONGEST, prob.numel()))
-        weight, place = weight[weight > 0], place[weight > 0]
-        i, j = place // prob.shape[1], place % prob.shape[1]
-        weighted = x[0, i, :3], y[0, j, :3], weight.sqrt(), _INLIER_THRESHOLD
+        matches, confidence = strongest_matches(prob, _STRONGEST)
+        weighted = *ends_of(matches, x[0], y[0]), confidence.sqrt(), _INLIER_THRESHOLD
         fits = fit_triples(*weighted, generator=torch.Generator().manual_seed(seed))
-        by_matches = best_by_matches(*fits, *weighted, _BY_MATCHES)
-        rotation, translation = fits
-        best = best_distinct(rotation, rough_agreement(*fits, x[0], y[0]), _BY_AGREEMENT)
-        by_agreement = rotation[best], translation[best]
-        ranked = [rigid.to_homogeneous(*fit) for fit in (by_matches, by_agreement)]
-        transforms = np.concatenate([*ranked, own_transform])
-        matches = torch.stack([i, j], 1).numpy()
-        confidence = weight.double().numpy()
+        by_matches = rigid.to_homogeneous(*best_by_matches(*fits, *weighted, _BY_MATCHES))
+        by_agreement = best_by_agreement(*fits, x[0], y[0], _BY_AGREEMENT)
+        transforms = np.concatenate([by_matches, by_agreement, own_transform])
         features = correspondence.feature_source[0].cpu(), correspondence.feature_target[0].cpu()
         unmatched = unmatched_nll(correspondence)
         return Hypotheses(
-            transforms, matches, confidence, prob, unmatched, features, self.verification
+            transforms,
+            matches.numpy(),
+            confidence.double().numpy(),
+            prob,
+            unmatched,
+            features,
+            self.verification,
         )
 
     def _predict(
@@ -175,6 +173,67 @@ class NetworkHypotheses:
         if not np.isfinite(transform).all():
             raise CorrmatError("the network's transform is not finite: has its training diverged?")
         return transform, prediction.correspondence
+
+
+def strongest_matches(prob: torch.Tensor, count: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the strongest matches (K, 2), K <= count, and their probabilities (K,).
+
+    Args:
+        prob: (N, M). A match is an entry that is the maximum of its row or of its column.
+        count: of matches at most.
+    """
+    is_max = (prob == prob.amax(0)) | (prob == prob.amax(1, keepdim=True))
+    weight, place = (prob * is_max).flatten().topk(min(count, prob.numel()))
+    weight, place = weight[weight > 0], place[weight > 0]
+    return torch.stack([place // prob.shape[1], place % prob.shape[1]], 1), weight
+
+
+def ends_of(
+    matches: torch.Tensor, source: torch.Tensor, target: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the source points and the target points (K, 3) of matches (K, 2)."""
+    return source[matches[:, 0], :3], target[matches[:, 1], :3]
+
+
+def from_many_matches(
+    prob: torch.Tensor, source: np.ndarray, target: np.ndarray, seed: int
+) -> np.ndarray:
+    """Fit transforms to many more matches: (T, 4, 4).
+
+    Where two scans share little, hardly any of the strongest matches are right. Among more of them
+    there are more right ones, and the clouds tell which transforms are.
+
+    Args:
+        prob: (N, M) of the model.
+        source: (N, 6), xyz and unit normal.
+        target: (M, 6).
+        seed: of the random draws.
+    """
+    x, y = (torch.from_numpy(np.asarray(cloud, np.float32)) for cloud in (source, target))
+    matches, weight = strongest_matches(prob, _MANY)
+    fits = fit_triples(
+        *ends_of(matches, x, y),
+        weight.sqrt(),
+        _INLIER_THRESHOLD,
+        generator=torch.Generator().manual_seed(seed),
+    )
+    return best_by_agreement(*fits, x, y, _BY_MANY)
+
+
+def best_by_agreement(
+    rotation: torch.Tensor,
+    translation: torch.Tensor,
+    source: torch.Tensor,
+    target: torch.Tensor,
+    count: int,
+) -> np.ndarray:
+    """Select the distinct transforms that put two clouds best on each other, roughly: (T, 4, 4).
+
+    Args: see `rough_agreement`; count is the number of transforms returned at most.
+    """
+    agreement = rough_agreement(rotation, translation, source, target)
+    best = best_distinct(rotation, agreement, count)
+    return rigid.to_homogeneous(rotation[best], translation[best])
 
 
 def unmatched_nll(c: SoftCorrespondence) -> tuple[np.ndarray, np.ndarray] | None:

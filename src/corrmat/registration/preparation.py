@@ -124,6 +124,7 @@ class PreparedClouds(NamedTuple):
     scale: float  # from the user's units to those in which a cloud's radius is about one
     subsamples: tuple[np.ndarray, np.ndarray]  # (N, 6) and (M, 6), for the model
     scorers: list[AlignmentScorer]  # of more and more points; the first of each are the model's
+    seed: int  # of the subsamples, and of random draws
 
     def to_original_units(self, transform: np.ndarray) -> np.ndarray:
         """Convert a transform (4, 4) of the prepared clouds to the user's coordinates."""
@@ -148,7 +149,7 @@ def prepare_clouds(
     scale = 2 * MEDIAN / (x.median + y.median)
     subsamples = x.with_normals(scale, MODEL_POINTS), y.with_normals(scale, MODEL_POINTS)
     scorers = scorers_of_levels(x.points(scale, FULL_POINTS), y.points(scale, FULL_POINTS))
-    return PreparedClouds(x, y, scale, subsamples, scorers)
+    return PreparedClouds(x, y, scale, subsamples, scorers, seed)
 
 
 def as_rigid(transform: np.ndarray) -> np.ndarray:
