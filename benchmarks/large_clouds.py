@@ -137,7 +137,7 @@ def choices_of(
     own = search.refine_a_little(search.hypotheses.transforms)
     own_measures = search.measure(own)
     found, measures = search.find(half_turns=True)
-    with mock.patch.object(choice, "MANY_KEPT", 0):
+    with mock.patch.object(choice, "MANY_KEPT", 0):  # as if there were no such candidates
         fewer, fewer_measures = search.find(half_turns=True)
 
     def chosen(among: np.ndarray, measured: list[Measures], weights: ChoiceWeights) -> np.ndarray:

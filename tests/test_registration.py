@@ -600,7 +600,7 @@ def test_a_verdict_is_a_confidence_in_words(confidence, words):
 def test_the_help_and_the_document_name_the_confidence_of_aligned():
     assert f'"aligned" from a confidence of {SURE:.0%}'.replace("%", " %") in REGISTER_EPILOG
     document = (Path(__file__).parents[1] / "docs" / "register.md").read_text()
-    assert f'From {SURE} on the verdict is "aligned"' in document
+    assert f'`verdict`: "aligned" from {SURE} on' in document
 
 
 def test_a_network_of_ones_own_registers():

@@ -288,12 +288,15 @@ def test_a_file_cut_short_is_an_error_not_fewer_points(tmp_path, kind):
         read_scan(path)
 
 
-@pytest.mark.parametrize("version", [".5", "0.6", ".7"])
-def test_a_pcd_of_an_older_version_is_read(tmp_path, version):
+@pytest.mark.parametrize(
+    ("version", "fields", "count"),
+    [(".5", "FIELDS", ""), (".5", "COLUMNS", "COUNT 1 1 1\n"), ("0.6", "FIELDS", "COUNT 1 1 1\n")],
+)
+def test_a_pcd_of_an_older_version_is_read(tmp_path, version, fields, count):
     """PCL's own bunny is of version .5, which has no viewpoint."""
-    header = f"# .PCD v{version}\nVERSION {version}\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\n"
+    header = f"# .PCD v{version}\nVERSION {version}\n{fields} x y z\nSIZE 4 4 4\nTYPE F F F\n"
     rows = "\n".join(map("{} {} {}".format, *POINTS.T))
-    header += f"COUNT 1 1 1\nWIDTH {len(POINTS)}\nHEIGHT 1\nPOINTS {len(POINTS)}\nDATA ascii\n"
+    header += f"{count}WIDTH {len(POINTS)}\nHEIGHT 1\nPOINTS {len(POINTS)}\nDATA ascii\n"
     (tmp_path / "old.pcd").write_text(header + rows)
     np.testing.assert_allclose(read_scan(tmp_path / "old.pcd"), POINTS, atol=1e-5)
 

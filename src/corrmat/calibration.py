@@ -38,8 +38,8 @@ class Scores(NamedTuple):
 
     agreement: float  # in [0, 1]: how much of each cloud lies on the other
     support: float | None  # in [0, 1]: share of the matches that the transform explains, if any
-    coherence: float | None = None  # of two clouds of more than 2,048 points
-    correlation: float | None = None  # their phase correlation
+    coherence: float | None = None  # None unless both clouds have more than 2,048 points
+    correlation: float | None = None  # likewise, their phase correlation
 
     def of_large_clouds(self) -> tuple[float, float, float] | None:
         """Return what the curve of two large clouds is over, of order one; None for others.

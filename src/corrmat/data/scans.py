@@ -29,7 +29,6 @@ _XYZ = {"x", "y", "z"}
 _NORMALS = ("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z")
 _MOST_COLUMNS = 32  # of an array of points: x, y, z, and whatever else was measured
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+").fullmatch
-_PCD_VERSION = re.compile(rb"^VERSION .*$", re.MULTILINE)
 _FACES = re.compile(rb"^element (face|tristrips) +[1-9]", re.MULTILINE)
 
 
@@ -234,7 +233,7 @@ def _scene(path: Path) -> "np.ndarray | trimesh.Trimesh":
 def _ply(path: Path) -> "np.ndarray | trimesh.Trimesh":
     """Return the vertices of a PLY file without faces; read one with faces as a mesh."""
     with path.open("rb") as file:
-        header = _ply_header(file)
+        header = _header(file, b"end_header")
     if _FACES.search(header):
         return _scene(path)
     vertices = _ply_content(path)["vertex"]
@@ -252,7 +251,7 @@ def _ply_content(path: Path) -> "plyfile.PlyData":
     import plyfile
 
     with path.open("rb") as file:
-        header = _ply_header(file)
+        header = _header(file, b"end_header")
         clean = re.sub(rb"[ \t]+\n", b"\n", header).decode("ascii", "replace")
         clean = clean.encode("ascii", "replace")
         if clean == header:
@@ -260,12 +259,12 @@ def _ply_content(path: Path) -> "plyfile.PlyData":
         return plyfile.PlyData.read(io.BytesIO(clean + file.read()))
 
 
-def _ply_header(file: BinaryIO) -> bytes:
-    """Read the header of a PLY file, its last line included."""
+def _header(file: BinaryIO, last: bytes) -> bytes:
+    """Read the header of a file, up to the line that begins with `last`, which is included."""
     header = b""
     for line in file:
         header += line
-        if line.startswith(b"end_header"):
+        if line.startswith(last):
             break
     return header
 
@@ -282,13 +281,27 @@ def _stack(vertices: "plyfile.PlyElement", fields: Sequence[str]) -> np.ndarray:
 
 
 def _open_pcd(path: Path) -> "pypcd4.pypcd4.PointCloud":
-    """Read a PCD file. The reader wants version 0.7; older ones differ in the number alone."""
+    """Read a PCD file. The reader wants the header of version 0.7; older ones are rewritten."""
     from pypcd4.pypcd4 import PointCloud
 
-    header, data, rows = path.read_bytes().partition(b"\nDATA ")
-    header = _PCD_VERSION.sub(b"VERSION 0.7", header, 1)
-    content = io.BytesIO(header + data + rows)
+    with path.open("rb") as file:
+        header = _header(file, b"DATA")
+        current = _as_pcd_7(header)
+        if current == header:
+            return PointCloud.from_path(path)
+        content = io.BytesIO(current + file.read())
     return PointCloud.from_fileobj(io.BufferedReader(content))
+
+
+def _as_pcd_7(header: bytes) -> bytes:
+    """Bring the header of a PCD file to version 0.7: other names, and a count where it lacks."""
+    header = re.sub(rb"^VERSION[ \t]+0?\.[56]\b", b"VERSION 0.7", header, flags=re.MULTILINE)
+    header = re.sub(rb"^COLUMNS\b", b"FIELDS", header, flags=re.MULTILINE)
+    fields = re.search(rb"^FIELDS (.*)$", header, re.MULTILINE)
+    if fields and not re.search(rb"^COUNT\b", header, re.MULTILINE):
+        counts = b" 1" * len(fields[1].split())
+        header = header.replace(b"\nWIDTH", b"\nCOUNT" + counts + b"\nWIDTH", 1)
+    return header
 
 
 def _pcd(path: Path) -> np.ndarray:

@@ -31,11 +31,11 @@ class ChoiceWeights(NamedTuple):
     unmatched_loss: float
     support: float
     correlation: float
-    verification: float  # the logit of the verification network, for the best of the others' sum
+    verification: float  # of the network's logit, for those that are best by the others alone
 
 
 class Measures(NamedTuple):
-    """What the choice among candidates weighs of one, but for the verification."""
+    """What a candidate's score weighs, without the verification."""
 
     agreement: float  # see `scoring.Alignment`
     coherence: float  # likewise
@@ -187,9 +187,10 @@ class CandidateSearch:
     def find(self, *, half_turns: bool) -> tuple[np.ndarray, list[Measures]]:
         """Refine and measure hypotheses, drop copies, and add what the best may be mistaken for.
 
-        If a cloud is large, the peaks of the phase correlation are hypotheses, too, and what many
-        more matches say. A thing that is nearly symmetric fits itself after half a turn. So the
-        best candidates are turned by 180 degrees about each principal axis as well.
+        If a cloud is large and the model has matches, more hypotheses come from the peaks of the
+        phase correlation and from many more matches. A thing that is nearly symmetric fits itself
+        after half a turn. So the best candidates are turned by 180 degrees about each principal
+        axis as well.
 
         Args:
             half_turns: whether to add them. Only a verification network can tell them from the
@@ -249,7 +250,7 @@ class CandidateSearch:
         return measures
 
     def scores(self, transform: np.ndarray) -> Scores:
-        """Compute what the confidence in a transform (4, 4) rests on."""
+        """Compute the scores that the confidence in a transform (4, 4) is computed from."""
         measures = self.measure(transform[None])[0]
         support = measures.support if len(self.hypotheses.matches) else None
         if not self.correlation_of_large:

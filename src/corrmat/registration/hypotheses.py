@@ -34,7 +34,7 @@ from corrmat.weights import load_verification
 _STRONGEST = 256  # matches that RANSAC draws from
 _INLIER_THRESHOLD = 0.15  # largest residual of a match
 _BY_MATCHES, _BY_AGREEMENT = 16, 24  # hypotheses at most
-_MANY, _BY_MANY = 2048, 200  # the same of large clouds: matches, and hypotheses by agreement
+_MANY, _BY_MANY = 2048, 200  # where a cloud is large: matches, and hypotheses by agreement
 _ROUGH_POINTS = 64, 256  # of source and target, to rank them by
 _ROUGH_DISTANCE = 0.3  # beyond which two points do not agree
 _MAX_UNMATCHED_NLL = 8.0  # of a point: the network may be wrong
@@ -107,9 +107,7 @@ class NetworkHypotheses:
 
     The transforms that RANSAC fits to triples of matches are ranked twice: by the matches that they
     explain, and by how well they put the clouds on each other, which right transforms do even
-    where most matches are wrong.
-
-    The network's own transform comes on top.
+    where most matches are wrong. The network's own transform is one more hypothesis.
 
     Args:
         network: (source, target) -> Prediction with a correspondence.

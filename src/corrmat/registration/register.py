@@ -35,9 +35,9 @@ def register(
 ) -> Registration:
     """Find the rigid transform that takes the source onto the target.
 
-    The clouds may be in any units, overlap in part, share no point, and have outliers. Stray
-    points, more than thirty median distances from the middle, are left out. The same points in any
-    order, with the same seed, give the same matrix.
+    The clouds may be in any unit, the same for both, overlap in part, share no point, and have
+    outliers. Stray points, more than thirty median distances from the middle, are left out. The
+    same points in any order, with the same seed, give the same matrix.
 
     Args:
         source: (N, 3), or (N, 6) with unit normals; or a `Cloud` of such points and this seed.
@@ -45,9 +45,10 @@ def register(
         model: "corrmat" for the shipped weights; "icp", or where they are installed "ransac",
             "ransac17", "fgr" or "kiss", for the classical pipelines; whatever else `load_model`
             takes; or a network, or a method, of your own.
-        refine: "icp": generalised ICP of all candidates of the model, then EM-ICP of the best, or
-            generalised ICP on more and more points where both clouds have more than 2,048; or
-            "none": the candidates as they are.
+        refine: "icp": generalised ICP of all candidates, then EM-ICP of the best, then generalised
+            ICP on more and more points where a cloud has more than 2,048 (without EM-ICP if both
+            have, and the model has matches). Or "none": the model's own candidates as they are,
+            without half turns, and without those of large clouds.
         init: (4, 4), a guess of the transform, such as an odometry's: one more candidate, or with
             model="icp" the only one.
         seed: of subsampling and of the model's random draws.

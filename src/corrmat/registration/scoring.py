@@ -20,7 +20,7 @@ _TOO_SMALL = 10  # points, for small_gicp
 _SAME = 0.02  # of `max_distance`: points that lie nearer than this are one point
 _SHARED = 0.1  # share of the source's points that are the target's, too
 # Least mean square of what surfaces resist of a motion that they hold: by the target's normals,
-# whose noise resists a little, and by the product of both clouds' (benchmarks/sliding.py).
+# whose noise resists a little, and by the product of both clouds' (benchmarks/free_motions.py).
 _HELD, _HELD_BY_BOTH = 0.01, 0.001
 _MAIN = 0.7  # least length of the shift, or the turn, in a free motion of length one
 

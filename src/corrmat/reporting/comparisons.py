@@ -347,15 +347,16 @@ def real_scans_table(results: Path) -> str:
         return "No real scans are recorded; `benchmarks/real_scans.py` registers some."
     rows: list[RealScansRow] = json.loads(path.read_text())["rows"]
     models = list(rows[0]["right"] or {})
-    verdicts = ", ".join(get_args(Verdict))
-    lines = markdown_head(["scans", "points", *models, "median deg", verdicts, "s"])
+    words = ", ".join(get_args(Verdict))
+    ours = "corrmat's median deg", f"corrmat: {words}", "corrmat's s"
+    lines = markdown_head(["scans", "points", *models, *ours])
     for row in rows:
         right = row["right"] or {}
         lines.append(
             markdown_row(
                 [
                     row["scans"],
-                    ", ".join(f"{count:,}" for count in row["points"]),
+                    " and ".join(f"{count:,}" for count in row["points"]),
                     *(f"{right[m]} of {row['registrations']}" if right else "" for m in models),
                     "" if row["median_deg"] is None else f"{row['median_deg']:.2g}",
                     ", ".join(map(str, row["verdicts"])),
