@@ -11,7 +11,7 @@ from pathlib import Path
 
 from corrmat.files import replace_json
 from corrmat.registration import benchmark
-from corrmat.reporting.comparisons import UNRELATED
+from corrmat.reporting.confidences import UNRELATED
 from corrmat.revision import commit
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"

@@ -15,7 +15,7 @@ from corrmat.data import registry
 from corrmat.data.scan_pairs import OVERLAP, make_object_pair, make_room_pair
 from corrmat.errors import CorrmatError
 from corrmat.registration import benchmark, shipping
-from corrmat.reporting import comparisons
+from corrmat.reporting import comparisons, confidences, training_runs
 from corrmat.reporting.model_results import write_comparison
 
 
@@ -88,7 +88,7 @@ def test_the_command_prints_one_table_and_writes_a_record(pairs, tmp_path, capsy
     )
     rows = comparisons.comparison_table(tmp_path / "results").splitlines()[2:]
     assert [row.split(" | ")[3] for row in rows] == ["icp", "corrmat"]
-    confidence = comparisons.confidence_table(tmp_path / "results")
+    confidence = confidences.confidence_table(tmp_path / "results")
     rows = [row.split(" | ") for row in confidence.splitlines() if "| shapes |" in row]
     assert sum(int(row[2]) for row in rows) == 4
     assert "4 pairs of small clouds: expected calibration error over 10 bins 0." in confidence
@@ -123,18 +123,18 @@ def test_unrelated_pairs_are_counted_below_the_confidence(tmp_path):
         {"protocol": "rooms", "points": 256},
     )
     entry = {"protocol": "rooms", "points": 256, "result": asdict(result)}
-    (tmp_path / comparisons.UNRELATED).write_text(json.dumps({"pairs": [entry, entry]}))
-    last = comparisons.confidence_table(tmp_path).splitlines()[-1]
+    (tmp_path / confidences.UNRELATED).write_text(json.dumps({"pairs": [entry, entry]}))
+    last = confidences.confidence_table(tmp_path).splitlines()[-1]
     assert last == "4 unrelated pairs of rooms: 0 aligned, 0 probably aligned, 4 doubtful."
 
 
 def test_calibration_intervals_and_paired_test_by_hand():
     promised = np.array([0.05, 0.05, 0.95, 0.95])
-    error = comparisons.expected_calibration_error(promised, np.array([False, True, True, True]))
+    error = confidences.expected_calibration_error(promised, np.array([False, True, True, True]))
     assert error == pytest.approx((0.9 + 0.1) / 4)
     # Two chances of a half: both right, or none, is an error of a half; else there is none.
-    assert comparisons.calibration_error_by_chance(np.array([0.5, 0.5])) == (0, 0.5)
-    assert comparisons.calibration_error_by_chance(np.ones(9)) == (0, 0)
+    assert confidences.calibration_error_by_chance(np.array([0.5, 0.5])) == (0, 0.5)
+    assert confidences.calibration_error_by_chance(np.ones(9)) == (0, 0)
     ours = np.array([True] * 9 + [False])
     assert comparisons._wilson(ours) == "60 to 98"
     theirs = np.array([True] * 3 + [False] * 6 + [True])
@@ -153,17 +153,17 @@ def test_what_cannot_be_compared_is_said(pairs):
 
 
 def test_the_training_of_the_shipped_weights_is_drawn(tmp_path):
-    comparisons.draw_training(tmp_path)
+    training_runs.draw_training(tmp_path)
     recalls = {"real": 0.5, "views": 0.7, "clean": 0.9}
     points = [{"pairs_seen": 100 * i, "loss": 9.0 - i} for i in range(1, 4)]
     for before in (0, 300):
         run = {"before": before, "pairs": before + 300, "curve": points, "validation": recalls}
         shipping.add_training(tmp_path, run)
         recalls = {"real": 0.57, "views": 0.71, "clean": 0.88}
-    comparisons.draw_training(tmp_path)
+    training_runs.draw_training(tmp_path)
     assert (tmp_path / "register" / "training.png").stat().st_size > 10_000
     # From 300 to 600 pairs is one doubling.
-    assert "real +7.0, views +1.0, clean -2.0." in comparisons.doubling_summary(tmp_path)
+    assert "real +7.0, views +1.0, clean -2.0." in training_runs.doubling_summary(tmp_path)
 
 
 def test_the_table_of_the_choice_has_a_row_for_all_weights(tmp_path):

@@ -9,7 +9,7 @@ from corrmat import weights
 from corrmat.errors import CorrmatError
 from corrmat.files import ensure_writable, replace_json
 from corrmat.registration.calibrate import calibrate
-from corrmat.reporting.comparisons import TRAINING, TrainingRun, training_runs
+from corrmat.reporting.training_runs import TRAINING, TrainingRun, training_runs
 from corrmat.revision import commit
 
 

@@ -2,43 +2,21 @@
 
 import json
 from pathlib import Path
-from typing import Any, NotRequired, TypedDict, get_args
+from typing import Any, TypedDict, get_args
 
 import numpy as np
-from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, NullLocator
 from scipy import stats
 
-from corrmat.calibration import Verdict, shipped_calibration, verdict_words
-from corrmat.reporting.figures import BLUE, GREEN, RED, save
+from corrmat.calibration import Verdict
 from corrmat.reporting.model_results import Comparison, ModelResult, read_comparison
 from corrmat.reporting.tables import markdown_head, markdown_row
 from corrmat.weights import shipped_metadata
 
 OURS = "corrmat"
-TRAINING = Path("register", "training.json")  # below results/: how the shipped weights were trained
-UNRELATED = Path("register", "unrelated.json")  # what they make of clouds of two different things
-FREE_MOTIONS = Path("register", "free_motions.json")  # of what slides or turns, and of others
-REAL_SCANS = Path("register", "real_scans.json")  # of scans that were not simulated
-_PROTOCOLS = ("real", "views", "clean", "dense", "rooms")  # in the order of the tables
-_SMALL = "real", "views", "clean"  # clouds of at most 1,024 points
-# Protocols of each kind of clouds.
-_KINDS = {"small clouds": _SMALL, "dense scans of objects": ("dense",), "rooms": ("rooms",)}
-_BINS = 10  # of the expected calibration error
-_DRAWS = 1000  # of what chance alone makes of it
-
-
-class TrainingRun(TypedDict):
-    """A training of the shipped weights; an entry of results/register/training.json."""
-
-    before: int  # pairs that the weights had seen when it started
-    pairs: int  # and when it ended
-    seed: NotRequired[int]  # not of the first runs
-    pairs_seen: int
-    train_seconds: float | None
-    commit: str
-    curve: list[dict[str, float]]  # on validation pairs
-    validation: dict[str, float]  # share of each protocol's held-out pairs within 5 degrees
+# Below results/: what slides or turns, and what does not; and scans that were not simulated.
+FREE_MOTIONS = Path("register", "free_motions.json")
+REAL_SCANS = Path("register", "real_scans.json")
+PROTOCOLS = ("real", "views", "clean", "dense", "rooms")  # in the order of the tables
 
 
 class FreeMotionsRow(TypedDict):
@@ -66,7 +44,7 @@ class RealScansRow(TypedDict):
 
 def comparison_summary(results: Path) -> str:
     """Build README's table: recall at 5 degrees of every model, ours with its interval."""
-    records = _read_comparisons(results)
+    records = read_comparisons(results)
     if not records:
         return "No comparison is recorded; `make protocols` makes them."
     models = list(records[0].models)
@@ -93,7 +71,7 @@ def comparison_table(results: Path) -> str:
     """
     heads = ["pairs", "data", "points", "model", "within 5 deg", "ADD-S", "p", "median deg", "ms"]
     lines = markdown_head(heads)
-    for record in _read_comparisons(results):
+    for record in read_comparisons(results):
         ours = record.models[OURS].within_angle
         for model, result in record.models.items():
             start = [record.protocol, record.data, str(record.points), model]
@@ -162,7 +140,7 @@ def choice_table(results: Path) -> str:
     if not path.is_file():
         return "No choice is recorded."
     record = json.loads(path.read_text())
-    protocols = [name for name in _PROTOCOLS if name in record]
+    protocols = [name for name in PROTOCOLS if name in record]
     heads = ["weights of coherence, unmatched loss, support, verification", *protocols]
     lines = markdown_head(heads)
     for weights in record[protocols[0]]["weights"]:
@@ -192,132 +170,6 @@ def large_choice_table(results: Path) -> str:
         shares = [f"{row['recall_5deg']:.0%}, {row['recall_adds']:.0%}" for row in rows]
         lines.append(markdown_row([choice, *shares]))
     return "\n".join(lines)
-
-
-def confidence_table(results: Path) -> str:
-    """Build the table of verdicts: what their confidence promised, and what was so.
-
-    Below it stands the expected calibration error of each kind of clouds, and what is said of
-    unrelated ones.
-    """
-    heads = ["verdict", "data", "pairs", "promised", "aligned", "wrong"]
-    lines, summaries = markdown_head(heads), []
-    comparisons, unrelated = _read_comparisons(results), _read_unrelated(results)
-    for what, protocols in _KINDS.items():
-        both = []
-        records = [c for c in comparisons if c.protocol in protocols]
-        for data in sorted({c.data for c in records}, reverse=True):
-            ours = [c.models[OURS] for c in records if c.data == data]
-            promised = np.concatenate([_confidence(result) for result in ours])
-            aligned = np.concatenate([result.aligned for result in ours])
-            both.append((promised, aligned))
-            verdicts = _verdicts(promised)
-            for words in get_args(Verdict):
-                inside = verdicts == words
-                if inside.any():
-                    means = [f"{values[inside].mean():.0%}" for values in (promised, aligned)]
-                    counts = [str(number) for number in (inside.sum(), (inside & ~aligned).sum())]
-                    about = data if protocols == _SMALL else protocols[0]
-                    lines.append(markdown_row([words, about, counts[0], *means, counts[1]]))
-        if both:
-            promised, aligned = map(np.concatenate, zip(*both, strict=True))
-            error = expected_calibration_error(promised, aligned)
-            text = f"expected calibration error over {_BINS} bins {error:.3f}"
-            low, high = calibration_error_by_chance(promised)
-            perfect = f"a perfect confidence would show {low:.3f} to {high:.3f} on so many"
-            summaries += ["", f"{len(promised)} pairs of {what}: {text} ({perfect})."]
-        of_unrelated = [result for protocol, result in unrelated if protocol in protocols]
-        if of_unrelated:
-            confidence = np.concatenate([_confidence(result) for result in of_unrelated])
-            verdicts = _verdicts(confidence).tolist()
-            counts = ", ".join(f"{verdicts.count(words)} {words}" for words in get_args(Verdict))
-            summaries += ["", f"{len(verdicts)} unrelated pairs of {what}: {counts}."]
-    return "\n".join(lines + summaries)
-
-
-def expected_calibration_error(promised: np.ndarray, happened: np.ndarray) -> float:
-    """Compute the mean gap between promise and outcome over bins of equal width, by pairs.
-
-    Args:
-        promised: (n,) chances in [0, 1].
-        happened: (n,) bool.
-    """
-    bins = np.minimum((promised * _BINS).astype(int), _BINS - 1)
-    gaps = [abs((promised - happened)[bins == b].sum()) for b in range(_BINS)]
-    return float(sum(gaps) / len(promised))
-
-
-def calibration_error_by_chance(promised: np.ndarray) -> tuple[float, float]:
-    """Compute the calibration error that a perfect confidence (n,) shows by chance.
-
-    Returns:
-        Its 90 % interval.
-    """
-    rng = np.random.default_rng(0)
-    drawn = rng.random((_DRAWS, len(promised))) < promised
-    low, high = np.percentile([expected_calibration_error(promised, d) for d in drawn], [5, 95])
-    return float(low), float(high)
-
-
-def doubling_summary(results: Path) -> str:
-    """Say what twice the training pairs would bring, by a line through the ends of the runs."""
-    runs = training_runs(results)
-    if len(runs) < 2:
-        return "Fewer than two training runs are recorded."
-    gains = []
-    for protocol in _PROTOCOLS:
-        if protocol in runs[0]["validation"]:
-            slope, _ = _recall_line(runs, protocol)
-            gains.append(f"{protocol} {slope:+.1f}")
-    return (
-        f"A straight line through the ends of the {len(runs)} runs, over the logarithm of the "
-        f"pairs, says what twice the pairs bring, in points of recall: {', '.join(gains)}."
-    )
-
-
-def training_runs(results: Path) -> list[TrainingRun]:
-    """Read how the shipped weights were trained, a run an entry; none if nothing is recorded."""
-    path = results / TRAINING
-    return json.loads(path.read_text()) if path.is_file() else []
-
-
-def _recall_line(runs: list[TrainingRun], protocol: str) -> tuple[float, float]:
-    """Fit recall in per cent by a line in log2 of the pairs: slope and intercept."""
-    doublings = np.log2([run["pairs"] for run in runs])
-    slope, intercept = np.polyfit(doublings, [100 * r["validation"][protocol] for r in runs], 1)
-    return float(slope), float(intercept)
-
-
-def draw_training(results: Path) -> None:
-    """Draw how the shipped weights were trained: loss, and recall on held-out pairs.
-
-    A dotted line is the fit of `doubling_summary`, as far as twice the pairs.
-    Nothing is drawn where results/register/training.json is missing.
-    """
-    runs = training_runs(results)
-    if not runs:
-        return
-    figure = Figure(figsize=(8.2, 3), layout="constrained")
-    loss, recall = figure.subplots(1, 2)
-    for run in runs:
-        x = [run["before"] + point["pairs_seen"] for point in run["curve"]]
-        loss.plot(x, [point["loss"] for point in run["curve"]], color=BLUE)
-    for protocol, colour in zip(_PROTOCOLS, (RED, GREEN, BLUE), strict=False):
-        y = [100 * run["validation"][protocol] for run in runs]
-        recall.plot([run["pairs"] for run in runs], y, "o-", color=colour, label=protocol)
-        if len(runs) > 1:
-            ends = np.array([runs[0]["pairs"], 2 * runs[-1]["pairs"]])
-            slope, intercept = _recall_line(runs, protocol)
-            recall.plot(ends, slope * np.log2(ends) + intercept, ":", color=colour)
-    loss.set(title="training loss", xlabel="pairs seen")
-    recall.set(title="within 5 degrees, held out, %", xlabel="pairs seen", xscale="log")
-    recall.set_xticks([runs[0]["pairs"], runs[-1]["pairs"], 2 * runs[-1]["pairs"]])
-    recall.xaxis.set_minor_locator(NullLocator())
-    figure.legend(*recall.get_legend_handles_labels(), loc="outside lower center", ncols=3)
-    for axes in (loss, recall):
-        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-        axes.grid(alpha=0.3)
-    save(figure, results / "register" / "training.png")
 
 
 def _read_json(path: Path) -> dict[str, Any]:
@@ -367,29 +219,11 @@ def real_scans_table(results: Path) -> str:
     return "\n".join(lines)
 
 
-def _read_comparisons(results: Path) -> list[Comparison]:
+def read_comparisons(results: Path) -> list[Comparison]:
     """Read the comparisons of all protocols, in the order of the tables."""
     records = map(read_comparison, (results / "register").glob("*-*-*.json"))
-    kept = [record for record in records if record.protocol in _PROTOCOLS]
-    return sorted(kept, key=lambda r: (_PROTOCOLS.index(r.protocol), r.data, r.points))
-
-
-def _read_unrelated(results: Path) -> list[tuple[str, ModelResult]]:
-    """Read what our model makes of unrelated clouds, by protocol."""
-    path = results / UNRELATED
-    content = json.loads(path.read_text())["pairs"] if path.is_file() else []
-    return [(entry["protocol"], ModelResult(**entry["result"])) for entry in content]
-
-
-def _verdicts(confidence: np.ndarray) -> np.ndarray:
-    """Return the verdicts (n,) of confidences (n,), without their reasons."""
-    return np.array([verdict_words(each) for each in confidence])
-
-
-def _confidence(result: ModelResult) -> np.ndarray:
-    """Compute what the shipped calibration promised for each pair."""
-    calibration = shipped_calibration()
-    return np.array([calibration.confidence(scores) for scores in result.scores])
+    kept = [record for record in records if record.protocol in PROTOCOLS]
+    return sorted(kept, key=lambda r: (PROTOCOLS.index(r.protocol), r.data, r.points))
 
 
 def _recall_cells(result: ModelResult, ours: np.ndarray | None) -> list[str]:

@@ -25,15 +25,13 @@ from corrmat.reporting.comparisons import (
     choice_table,
     comparison_summary,
     comparison_table,
-    confidence_table,
-    doubling_summary,
-    draw_training,
     families_table,
     free_motions_table,
     large_choice_table,
     networks_table,
     real_scans_table,
 )
+from corrmat.reporting.confidences import confidence_table
 from corrmat.reporting.intervals import Estimate, as_text
 from corrmat.reporting.matrices import draw_matrices
 from corrmat.reporting.overview import draw_overview, longest_records
@@ -46,6 +44,7 @@ from corrmat.reporting.tables import (
     markdown_summary,
     markdown_tables,
 )
+from corrmat.reporting.training_runs import doubling_summary, draw_training
 from corrmat.reporting.writer import draw_record
 from corrmat.weights import shipped_metadata, shipped_models
 
