@@ -13,9 +13,11 @@ from corrmat.reporting.tables import markdown_head, markdown_row
 from corrmat.weights import shipped_metadata
 
 OURS = "corrmat"
-# Below results/: what slides or turns, and what does not; and scans that were not simulated.
+# Below results/: what slides or turns, and what does not; scans that were not simulated; and scenes
+# that the tool was not made for.
 FREE_MOTIONS = Path("register", "free_motions.json")
 REAL_SCANS = Path("register", "real_scans.json")
+OTHER_SCENES = Path("register", "other_scenes.json")
 PROTOCOLS = ("real", "views", "clean", "dense", "rooms")  # in the order of the tables
 
 
@@ -28,6 +30,16 @@ class FreeMotionsRow(TypedDict):
     turns: int  # registrations after which any turn about an axis is said to fit as well
     right: int | None  # with the right direction or axis; None where nothing slides or turns
     aligned: int  # registrations that are called "aligned"
+
+
+class OtherScenesRow(TypedDict):
+    """A row of results/register/other_scenes.json."""
+
+    scenes: str
+    registrations: int
+    right: int
+    median_deg: float
+    verdicts: list[int]  # aligned, probably aligned, doubtful
 
 
 class RealScansRow(TypedDict):
@@ -189,6 +201,20 @@ def free_motions_table(results: Path) -> str:
     for row in json.loads(path.read_text())["rows"]:
         cells = ["" if row[name] is None else str(row[name]) for name in heads]
         lines.append(markdown_row(cells))
+    return "\n".join(lines)
+
+
+def other_scenes_table(results: Path) -> str:
+    """Build the table of scenes that the tool was not made for."""
+    path = results / OTHER_SCENES
+    if not path.is_file():
+        return "Other scenes are not recorded; `benchmarks/other_scenes.py` registers some."
+    lines = markdown_head(["scenes", "right", "median deg", ", ".join(get_args(Verdict))])
+    rows: list[OtherScenesRow] = json.loads(path.read_text())["rows"]
+    for row in rows:
+        right = f"{row['right']} of {row['registrations']}"
+        verdicts = ", ".join(map(str, row["verdicts"]))
+        lines.append(markdown_row([row["scenes"], right, f"{row['median_deg']:.2g}", verdicts]))
     return "\n".join(lines)
 
 

@@ -29,6 +29,7 @@ from corrmat.reporting.comparisons import (
     free_motions_table,
     large_choice_table,
     networks_table,
+    other_scenes_table,
     real_scans_table,
 )
 from corrmat.reporting.confidences import confidence_table
@@ -290,6 +291,7 @@ TABLES: tuple[tuple[str, str, Callable[[Results], str]], ...] = (
     ("docs/how-it-works.md", "families", lambda results: families_table(results.folder)),
     ("docs/how-it-works.md", "doubling", lambda results: doubling_summary(results.folder)),
     ("docs/register.md", "real_scans", lambda results: real_scans_table(results.folder)),
+    ("docs/register.md", "other_scenes", lambda results: other_scenes_table(results.folder)),
     ("docs/register.md", "free_motions", lambda results: free_motions_table(results.folder)),
     ("docs/register.md", "confidence", lambda results: confidence_table(results.folder)),
     ("docs/speed.md", "bench", lambda results: bench_table(results.folder)),
