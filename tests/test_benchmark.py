@@ -230,3 +230,22 @@ def test_scans_of_fewer_points_repeat_some_in_a_batch():
     np.testing.assert_array_equal(pairs.source[0, 50:], few.source[:7])
     np.testing.assert_array_equal(pairs.source[1], many.source)
     assert pairs.target.shape == (2, 50, 3)
+
+
+def test_scans_and_scenes_have_tables(tmp_path):
+    assert "benchmarks/real_scans.py" in comparisons.real_scans_table(tmp_path)
+    assert "benchmarks/other_scenes.py" in comparisons.other_scenes_table(tmp_path)
+    (tmp_path / "register").mkdir()
+    row = {"median_deg": 0.123, "verdicts": [3, 1, 1], "registrations": 5}
+    scans = {"scans": "owl", "points": [1200, 900], "right": {"corrmat": 4, "icp": 1}, "seconds": 1}
+    strangers = {"scans": "owl, cat", "right": None, "median_deg": None}
+    for path, rows in (
+        (comparisons.REAL_SCANS, [row | scans, row | scans | strangers]),
+        (comparisons.OTHER_SCENES, [row | {"scenes": "hills", "right": 4}]),
+    ):
+        (tmp_path / path).write_text(json.dumps({"rows": rows}))
+    owl, strange = comparisons.real_scans_table(tmp_path).splitlines()[2:]
+    assert owl == "| owl | 1,200 and 900 | 4 of 5 | 1 of 5 | 0.12 | 3, 1, 1 | 1.0 |"
+    assert strange == "| owl, cat | 1,200 and 900 |  |  |  | 3, 1, 1 | 1.0 |"
+    hills = comparisons.other_scenes_table(tmp_path).splitlines()[-1]
+    assert hills == "| hills | 4 of 5 | 0.12 | 3, 1, 1 |"
