@@ -244,7 +244,8 @@ def test_scans_and_scenes_have_tables(tmp_path):
         (comparisons.OTHER_SCENES, [row | {"scenes": "hills", "right": 4}]),
     ):
         (tmp_path / path).write_text(json.dumps({"rows": rows}))
-    owl, strange = comparisons.real_scans_table(tmp_path).splitlines()[2:]
+    owl, strange, total = comparisons.real_scans_table(tmp_path).splitlines()[2:]
+    assert "| 4 of 5 | 1 of 5 |" in total
     assert owl == "| owl | 1,200 and 900 | 4 of 5 | 1 of 5 | 0.12 | 3, 1, 1 | 1.0 |"
     assert strange == "| owl, cat | 1,200 and 900 |  |  |  | 3, 1, 1 | 1.0 |"
     hills = comparisons.other_scenes_table(tmp_path).splitlines()[-1]

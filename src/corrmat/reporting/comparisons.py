@@ -1,6 +1,7 @@
 """Tables of `corrmat compare`'s records: the shipped weights beside the classical pipelines."""
 
 import json
+from collections import Counter
 from pathlib import Path
 from typing import Any, TypedDict, get_args
 
@@ -219,7 +220,10 @@ def other_scenes_table(results: Path) -> str:
 
 
 def real_scans_table(results: Path) -> str:
-    """Build the table of real scans: ours with its verdicts, and how often others are right."""
+    """Build the table of real scans: ours with its verdicts, and how often others are right.
+
+    The last row is the sum over the pairs that have something in common.
+    """
     path = results / REAL_SCANS
     if not path.is_file():
         return "No real scans are recorded; `benchmarks/real_scans.py` registers some."
@@ -228,20 +232,20 @@ def real_scans_table(results: Path) -> str:
     words = ", ".join(get_args(Verdict))
     ours = "corrmat's median deg", f"corrmat: {words}", "corrmat's s"
     lines = markdown_head(["scans", "points", *models, *ours])
+    totals, registrations = Counter[str](), 0
     for row in rows:
         right = row["right"] or {}
-        lines.append(
-            markdown_row(
-                [
-                    row["scans"],
-                    " and ".join(f"{count:,}" for count in row["points"]),
-                    *(f"{right[m]} of {row['registrations']}" if right else "" for m in models),
-                    "" if row["median_deg"] is None else f"{row['median_deg']:.2g}",
-                    ", ".join(map(str, row["verdicts"])),
-                    f"{row['seconds']:.1f}",
-                ]
-            )
-        )
+        if right:
+            totals.update(right)
+            registrations += row["registrations"]
+        points = " and ".join(f"{count:,}" for count in row["points"])
+        counts = [f"{right[m]} of {row['registrations']}" if right else "" for m in models]
+        median = "" if row["median_deg"] is None else f"{row['median_deg']:.2g}"
+        verdicts = ", ".join(map(str, row["verdicts"]))
+        cells = [row["scans"], points, *counts, median, verdicts, f"{row['seconds']:.1f}"]
+        lines.append(markdown_row(cells))
+    sums = [f"{totals[m]} of {registrations}" for m in models]
+    lines.append(markdown_row(["all that can be right", "", *sums, "", "", ""]))
     return "\n".join(lines)
 
 
