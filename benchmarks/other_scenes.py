@@ -8,15 +8,14 @@ results/register/other_scenes.json.
 """
 
 import statistics
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple, get_args
+from typing import NamedTuple
 
 import numpy as np
+from poses import count_verdicts, pose_error
 from scipy.spatial.transform import Rotation
 
-from corrmat.calibration import Verdict, verdict_words
 from corrmat.data.scan_pairs import make_room_pair
 from corrmat.files import replace_json
 from corrmat.metrics import RECALL_DEG
@@ -30,7 +29,7 @@ RESULTS = Path(__file__).resolve().parents[1] / "results"
 PAIRS, POINTS = 24, 20_000
 WAVES, ROUGHNESS, RELIEF = 60, 1.2, 0.12  # of a terrain; its height in lengths of a tile
 NOISE = 0.001  # lengths of a tile
-SHIFT = 0.1  # of a cloud's root mean square radius: farther off is wrong
+SHIFT = 0.1  # of a source's mean distance from its centroid: farther off is wrong
 
 
 class Pair(NamedTuple):
@@ -74,22 +73,19 @@ def turned(pair: Pair, rng: np.random.Generator) -> Pair:
 
 def measure(name: str, pairs: Iterator[Pair]) -> OtherScenesRow:
     """Register pairs, and count the right ones and the verdicts."""
-    right, verdicts, angles = 0, Counter[str](), []
+    right, angles, registrations = 0, [], []
     for pair in track(pairs, name, PAIRS):
-        registration = register(pair.source, pair.target)
-        off = registration.transform @ np.linalg.inv(pair.truth)
-        angles.append(float(np.degrees(Rotation.from_matrix(off[:3, :3]).magnitude())))
-        shifts = registration.apply(pair.source) - rigid.move(pair.truth, pair.source)
+        registrations.append(register(pair.source, pair.target))
+        angle, shift = pose_error(registrations[-1].transform, pair.truth, pair.source)
         radius = np.linalg.norm(pair.source - pair.source.mean(0), axis=1).mean()
-        near = np.linalg.norm(shifts, axis=1).mean() < SHIFT * radius
-        right += int(near and angles[-1] < RECALL_DEG)
-        verdicts[verdict_words(registration.confidence)] += 1
+        right += int(angle < RECALL_DEG and shift < SHIFT * radius)
+        angles.append(angle)
     return {
         "scenes": name,
         "registrations": PAIRS,
         "right": right,
         "median_deg": round(statistics.median(angles), 3),
-        "verdicts": [verdicts[verdict] for verdict in get_args(Verdict)],
+        "verdicts": count_verdicts(registrations),
     }
 
 

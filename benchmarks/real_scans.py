@@ -24,17 +24,16 @@ lies a picture of some.
 
 import argparse
 import statistics
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple, get_args
+from typing import NamedTuple
 
 import numpy as np
 from large_clouds import PIPELINES, VOXELS
 from matplotlib.figure import Figure
+from poses import count_verdicts, pose_error
 from scipy.spatial.transform import Rotation
 
-from corrmat.calibration import Verdict, verdict_words
 from corrmat.data.scans import read_scan
 from corrmat.files import replace_json
 from corrmat.metrics import RECALL_DEG
@@ -52,7 +51,7 @@ SHIFT = 0.1  # radii: mean distance that a right transform's points have from th
 DRAWN = "Armadillo, 60 to 0 deg", "bunny, 400 points", "depth camera", "LiDAR of a car"
 DOTS = 4000  # of each cloud in the picture
 HALF_WIDTH = 1.2  # radii that a panel shows to each side of the target's centroid
-AT_ONCE = "ransac17", "fgr", "icp"  # models of `register`; they get at most 1,024 points a cloud
+MODELS = "ransac17", "fgr", "icp"  # of `register`; they get at most 1,024 points of a cloud
 
 
 def turned(axis: str, degrees: float, shift: tuple[float, ...] = (0.0, 0.0, 0.0)) -> np.ndarray:
@@ -133,35 +132,27 @@ def measure(scans: Scans, folder: Path) -> RealScansRow:
     moved = [rigid.move(pose, source) for pose in poses]
 
     ours = [register(cloud, target) for cloud in moved]
-    verdicts = Counter(verdict_words(each.confidence) for each in ours)
     row: RealScansRow = {
         "scans": scans.name,
         "points": [len(source), len(target)],
         "registrations": POSES,
         "right": None,
         "median_deg": None,
-        "verdicts": [verdicts[verdict] for verdict in get_args(Verdict)],
+        "verdicts": count_verdicts(ours),
         "seconds": round(statistics.median(each.seconds for each in ours), 2),
     }
     if truth is None:
         return row
 
-    def degrees(transforms: Iterable[np.ndarray]) -> np.ndarray:
-        """Compute the rotation errors (POSES,)."""
-        off = np.stack(list(transforms)) @ poses @ np.linalg.inv(truth)
-        return np.degrees(Rotation.from_matrix(off[:, :3, :3]).magnitude())
+    def errors(transforms: Iterable[np.ndarray]) -> list[tuple[float, float]]:
+        found = zip(transforms, poses, strict=True)
+        return [pose_error(transform @ pose, truth, source) for transform, pose in found]
 
     def count_right(transforms: Iterable[np.ndarray]) -> int:
-        transforms = list(transforms)
-        true = rigid.move(truth, source)
-        shifts = [
-            np.linalg.norm(rigid.move(transform, cloud) - true, axis=1).mean()
-            for transform, cloud in zip(transforms, moved, strict=True)
-        ]
-        return int(((np.array(shifts) < SHIFT) & (degrees(transforms) < RECALL_DEG)).sum())
+        return sum(angle < RECALL_DEG and shift < SHIFT for angle, shift in errors(transforms))
 
     right = {OURS: count_right(each.transform for each in ours)}
-    for model in AT_ONCE:
+    for model in MODELS:
         found = (register(cloud, target, model=model) for cloud in moved)
         right[model] = count_right(each.transform for each in found)
     for name, voxels in VOXELS["dense"].items():
@@ -169,7 +160,7 @@ def measure(scans: Scans, folder: Path) -> RealScansRow:
         right[name] = max(
             count_right(pipeline(cloud, target, voxel)[0] for cloud in moved) for voxel in voxels
         )
-    median = statistics.median(degrees(each.transform for each in ours))
+    median = statistics.median(angle for angle, _ in errors(each.transform for each in ours))
     return row | {"right": right, "median_deg": round(median, 3)}
 
 
@@ -205,9 +196,10 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     folder = parser.parse_args().folder
     code = commit()
-    rows = [measure(scans, folder) for scans in track(all_scans(folder), "scans")]
+    pairs = all_scans(folder)
+    rows = [measure(scans, folder) for scans in track(pairs, "scans")]
     replace_json(RESULTS / REAL_SCANS, {"commit": code, "rows": rows})
-    draw([scans for scans in all_scans(folder) if scans.name in DRAWN], folder)
+    draw([scans for scans in pairs if scans.name in DRAWN], folder)
     for row in rows:
         print(row)
 
